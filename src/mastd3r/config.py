@@ -1,0 +1,152 @@
+"""One frozen dataclass a stage; ``Config`` joins them. YAML in and out; unknown keys are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import types
+import typing
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from .errors import ConfigError
+
+PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
+SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
+CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
+MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Which frames of the source are read."""
+
+    start: int = 0  # first frame, counted from 0
+    end: int | None = None  # one past the last frame; None = to the end
+    stride: int = 1  # every n-th frame
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """The lens. Empty = found from the video itself."""
+
+    intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1 k2 p1 p2 k3], pixels of the full-size image
+    estimate_radial: bool = True  # find k1 beside the focal length, where the video can tell it
+
+
+@dataclass(frozen=True)
+class MappingConfig:
+    """The Gaussian map (III-C)."""
+
+    enabled: bool = True
+    loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
+    width_px: int = 320  # width of the images that the map is trained on and rendered at
+    iterations: int = 3000  # optimisation steps, one view each
+    max_views: int = 160  # training views kept in memory
+    max_gaussians: int = 60000
+    dynamic_weight: float = 0.05  # beta of eq. (14)
+    hard_weight: bool = False  # True: eq. (14) as printed; False: w = 1 - 0.95 p
+    tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
+    lambda_uncertainty: float = 0.1  # eq. (17)
+
+
+HOLDOUT_EVERY = 8  # frames 0, 8, 16 … of those read are never shown to the map
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that decides a run, beside the source itself."""
+
+    pointmaps: PointmapKind = "auto"
+    semantics: SemanticsKind = "auto"
+    correction: CorrectionKind = "coarse-to-fine"
+    seed: int = 0
+    source: SourceConfig = field(default_factory=SourceConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    mapping: MappingConfig = field(default_factory=MappingConfig)
+
+
+def config_from_dict(data: dict[str, Any]) -> Config:
+    """Build a Config from nested mappings. Raises ConfigError for unknown keys and wrong types."""
+    return _build(Config, data, "")
+
+
+def config_from_yaml(path: Path) -> Config:
+    """Read a YAML file of overrides. Raises ConfigError."""
+    try:
+        data = yaml.safe_load(path.read_text()) or {}
+    except (OSError, yaml.YAMLError) as e:
+        raise ConfigError(f"config file {path}: expected readable YAML, got {e}") from e
+    if not isinstance(data, dict):
+        raise ConfigError(f"config file {path}: expected key: value pairs, got {type(data).__name__}")
+    return config_from_dict(data)
+
+
+def with_override(config: Config, dotted: str) -> Config:
+    """Apply one ``section.key=value``; the value is read as YAML. Raises ConfigError."""
+    key, eq, text = dotted.partition("=")
+    if not eq:
+        raise ConfigError(f"--set: expected section.key=value, got {dotted!r}")
+    nested: Any = yaml.safe_load(text)
+    for part in reversed(key.split(".")):
+        nested = {part: nested}
+    return _merge(config, nested, "")
+
+
+def config_to_yaml(config: Config) -> str:
+    """The whole effective configuration as YAML text."""
+    return yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, tuple) else value
+
+
+def _build(cls: type, data: dict[str, Any], where: str) -> Any:
+    return _merge(cls(), data, where)
+
+
+def _merge(obj: Any, data: Any, where: str) -> Any:
+    if not isinstance(data, dict):
+        raise ConfigError(f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {data!r}")
+    hints = typing.get_type_hints(type(obj))
+    names = [f.name for f in fields(obj)]
+    changes: dict[str, Any] = {}
+    for key, value in data.items():
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, n=1)
+            hint = f"; perhaps you meant {where}{near[0]}" if near else f"; known: {', '.join(names)}"
+            raise ConfigError(f"config: unknown key {where}{key}{hint}")
+        current = getattr(obj, key)
+        if is_dataclass(current):
+            changes[key] = _merge(current, value, f"{where}{key}.")
+        else:
+            changes[key] = _checked(value, hints[key], where + str(key))
+    return replace(obj, **changes)
+
+
+def _checked(value: Any, hint: Any, where: str) -> Any:
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        options = typing.get_args(hint)
+        if value not in options:
+            raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
+        return value
+    if origin in (typing.Union, types.UnionType):
+        if value is None:
+            return None
+        return _checked(value, next(a for a in typing.get_args(hint) if a is not type(None)), where)
+    if origin is tuple:
+        if not isinstance(value, list | tuple):
+            raise ConfigError(f"config {where}: expected a list, got {value!r}")
+        return tuple(_checked(v, typing.get_args(hint)[0], where) for v in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+        raise ConfigError(f"config {where}: expected {hint.__name__}, got {value!r}")
+    return value

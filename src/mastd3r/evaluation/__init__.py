@@ -1,0 +1,1 @@
+"""Trajectory, image and mask errors against truth."""

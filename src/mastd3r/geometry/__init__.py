@@ -1,0 +1,1 @@
+"""Cameras, rigid and similarity transforms, robust kernels: no SLAM knowledge."""

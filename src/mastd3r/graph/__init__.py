@@ -1,0 +1,1 @@
+"""Keyframes, their poses, and the joint optimisation."""

@@ -1,0 +1,1 @@
+"""The Gaussian map with dynamic suppression (paper III-C)."""

@@ -1,0 +1,1 @@
+"""Two-view pointmaps (paper III-A, first step) behind one protocol."""

@@ -1,0 +1,126 @@
+"""Every type that crosses from one stage to another, and nothing else.
+
+Conventions (docs/conventions.md): ``a_from_b`` maps points of b to points of a; cameras are OpenCV
+(+x right, +y down, +z forward); pixels are (x, y) with integers at pixel CENTRES; images are h w c;
+monocular lengths are map units and carry no suffix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .geometry.camera import Camera
+
+Array = NDArray[Any]
+State = Literal["started", "tracked", "interpolated", "lost"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image of the source, as the camera took it."""
+
+    index: int  # position in the source, counted before --start/--stride
+    timestamp_s: float
+    image: Array  # (h, w, 3) uint8 RGB, full resolution
+    depth_m: Array | None = None  # (h, w) float32 metres, 0 = none; only sources with a depth sensor
+    semantic: Array | None = None  # (h', w') float32 P(movable thing) in 0..1, any resolution
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a sequence knows about itself. Only ``evaluation`` may read it."""
+
+    timestamps_s: Array  # (n,) float64
+    world_from_cam: Array  # (n, 4, 4) float64; n may be 0
+    moving_files: dict[float, str] = field(default_factory=dict)  # timestamp_s -> 8-bit image, >127 moves
+    focal_px: float | None = None  # at full width
+
+
+class Source(Protocol):
+    """A re-iterable stream of frames: ``frames()`` may be called again and starts from the beginning."""
+
+    name: str
+    kind: str  # "video", "images", "tum", "synthetic"
+    size: tuple[int, int]  # (width, height) of the first frame, upright
+    length: int | None  # number of frames that frames() will give, None where unknown
+    notes: list[str]  # choices and warnings, for the log and run.json
+
+    def frames(self) -> Iterator[Frame]: ...
+    def truth(self) -> Truth | None: ...
+
+
+@dataclass(frozen=True)
+class Pointmap:
+    """One 3-D point a pixel. The holder's field name says whose camera frame the points are in."""
+
+    points: Array  # (h, w, 3) float32
+    confidence: Array  # (h, w) float32, 0 = unknown; comparable within one pointmap
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Pixel pairs of two views, at the provider's working resolution."""
+
+    ref_px: Array  # (n, 2) float64
+    new_px: Array  # (n, 2) float64
+    weight: Array  # (n,) float64 in 0..1; 0 = no match
+
+
+@dataclass(frozen=True)
+class View:
+    """One photograph for the Gaussian map: pinhole (undistorted), with its soft static weight."""
+
+    timestamp_s: float
+    image: Array  # (h, w, 3) float32 0..1 RGB
+    static: Array  # (h, w) float32, 1 - P(moving); 0 where the undistorted image has no data
+    world_from_cam: Array  # (4, 4) float64
+    camera: Camera  # at (h, w), k1 == 0
+    kf_id: int  # keyframe that this view hangs on
+    uncertainty: Array | None = None  # (h, w) float32 u(p) of eq. (16), 0 outside R
+
+
+@dataclass(frozen=True)
+class StaticCloud:
+    """The fused static points that the Gaussian map starts from."""
+
+    points_world: Array  # (n, 3) float32
+    colors: Array  # (n, 3) uint8 RGB
+    confidence: Array  # (n,) float32
+    spacing: Array  # (n,) float32, size in map units of the patch that a point stands for
+    kf_id: Array  # (n,) int32
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """Where one frame stands: a pose relative to its keyframe, and how it came by it."""
+
+    index: int
+    timestamp_s: float
+    kf_id: int
+    kf_from_cam: Array  # (4, 4) float64
+    state: State
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A camera pose for every frame."""
+
+    timestamps_s: Array  # (n,) float64
+    world_from_cam: Array  # (n, 4, 4) float64
+    states: tuple[State, ...]
+    is_keyframe: Array  # (n,) bool
+
+    def keyframes(self) -> Trajectory:
+        """The rows that are keyframes."""
+        keep = np.flatnonzero(self.is_keyframe)
+        return Trajectory(
+            self.timestamps_s[keep],
+            self.world_from_cam[keep],
+            tuple(self.states[i] for i in keep),
+            self.is_keyframe[keep],
+        )
