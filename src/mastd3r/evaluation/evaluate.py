@@ -1,0 +1,188 @@
+"""Figures of a run folder, from its files alone: trajectory.txt, keyframes.txt, masks/ and renders/."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..types import Frame, Truth
+from .image_error import psnr, ssim
+from .mask_error import MaskError, mask_error, read_mask
+from .trajectory_error import AteResult, ate_of_positions
+
+Array = NDArray[Any]
+PSNR_CEILING_DB = float(10 * np.log10(255**2 / 1e-9))  # stands for equal images, so that a mean exists
+MIN_STATIC_PX = 50  # fewer static pixels in a render say nothing
+
+
+@dataclass(frozen=True)
+class HoldoutError:
+    """One render against the photograph that the map has never seen."""
+
+    timestamp_s: float
+    psnr_db: float
+    ssim: float
+    psnr_static_db: float | None  # over truly static pixels; None where truth has no masks
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The flat figures, and what plots and pictures are made of."""
+
+    metrics: dict[str, Any]
+    ate: AteResult | None  # over all frames; None without truth
+    holdout: tuple[HoldoutError, ...]
+
+
+def evaluate_run(
+    run_dir: Path, truth: Truth | None, frames: Iterable[Frame], timestamps_s: Array | None = None
+) -> dict[str, Any]:
+    """The flat metrics of a run folder; ``evaluate`` with its arguments and errors."""
+    return evaluate(run_dir, truth, frames, timestamps_s).metrics
+
+
+def evaluate(
+    run_dir: Path, truth: Truth | None, frames: Iterable[Frame], timestamps_s: Array | None = None
+) -> Evaluation:
+    """Score the files of a run folder against a sequence, in one pass over its frames.
+
+    ``frames`` gives the photographs, full size, in order; those with a file in renders/ are compared.
+    ``timestamps_s`` (n,) are the times of the whole sequence where ``frames`` gives fewer. Figures that need
+    truth are absent without it; a figure that truth cannot give is None and ``*_note`` says why.
+    Raises InputError for a missing or malformed file and for renders of another sequence.
+    """
+    times, positions = read_positions(run_dir / "trajectory.txt")
+    moving = {_stamp(t): path for t, path in truth.moving_files.items()} if truth else {}
+    seen, holdout = _compare_renders(run_dir, frames, moving)
+    stamps = seen if timestamps_s is None else [_stamp(float(t)) for t in timestamps_s]
+    posed = {_stamp(float(t)) for t in times[np.isfinite(positions).all(1)]}
+    metrics: dict[str, Any] = {"frames": len(stamps), "frames_posed": sum(s in posed for s in stamps)}
+    ate = None
+    if truth is not None and len(truth.timestamps_s):
+        ate = _add_trajectory_error(metrics, run_dir, truth, times, positions)
+    _add_holdout(metrics, holdout)
+    _add_masks(metrics, _masks(run_dir, stamps, moving), has_truth=bool(moving))
+    return Evaluation(metrics, ate, tuple(holdout))
+
+
+def read_positions(path: Path) -> tuple[Array, Array]:
+    """Times (n,) and positions (n, 3) of a TUM trajectory file, in order of time. Raises InputError."""
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = line.split()
+        try:
+            rows.append([float(w) for w in words[:4]])
+        except ValueError as e:
+            raise InputError(f"{path} line {number}: expected numbers, got {line[:60]!r}") from e
+        if len(words) != 8:
+            raise InputError(f"{path} line {number}: expected 8 numbers, got {len(words)}")
+    data = np.array(rows, float).reshape(-1, 4)
+    data = data[np.argsort(data[:, 0], kind="stable")]
+    return data[:, 0], data[:, 1:]
+
+
+def _stamp(timestamp_s: float) -> str:
+    """A timestamp as the run folder's file names write it."""
+    return f"{timestamp_s:.6f}"
+
+
+def _add_trajectory_error(
+    metrics: dict[str, Any], run_dir: Path, truth: Truth, times: Array, positions: Array
+) -> AteResult:
+    true_positions = truth.world_from_cam[:, :3, 3]
+    ate = ate_of_positions(times, positions, truth.timestamps_s, true_positions)
+    metrics["ate_rmse_all"] = ate.rmse
+    if ate.reason:
+        metrics["ate_rmse_all_note"] = ate.reason
+    if (run_dir / "keyframes.txt").exists():
+        kf_times, kf_positions = read_positions(run_dir / "keyframes.txt")
+        kf = ate_of_positions(kf_times, kf_positions, truth.timestamps_s, true_positions)
+        metrics["ate_rmse_keyframes"] = kf.rmse
+        if kf.reason:
+            metrics["ate_rmse_keyframes_note"] = kf.reason
+    return ate
+
+
+def _compare_renders(
+    run_dir: Path, frames: Iterable[Frame], moving: dict[str, str]
+) -> tuple[list[str], list[HoldoutError]]:
+    """One pass over the frames: all their stamps, and the errors of those that have a render."""
+    renders = {p.stem: p for p in (run_dir / "renders").glob("*.png")}
+    seen: list[str] = []
+    holdout: list[HoldoutError] = []
+    for frame in frames:
+        stamp = _stamp(frame.timestamp_s)
+        seen.append(stamp)
+        if stamp in renders:
+            truth = read_mask(moving[stamp]) if stamp in moving else None
+            holdout.append(_compare(frame, renders[stamp], truth, has_masks=bool(moving)))
+    if renders and not holdout:
+        raise InputError(
+            f"{run_dir}/renders: expected timestamps of the sequence given, got {min(renders)} and others "
+            f"of which none is among its {len(seen)} frames"
+        )
+    return seen, holdout
+
+
+def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: bool) -> HoldoutError:
+    render = cv2.imread(str(render_path), cv2.IMREAD_COLOR)
+    if render is None:
+        raise InputError(f"{render_path}: expected a PNG image, got a file that is not one")
+    size = (render.shape[1], render.shape[0])
+    photograph = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)) / 255
+    splat = np.asarray(render)[..., ::-1] / 255
+    whole, similar = psnr(splat, photograph), ssim(splat, photograph)
+    if whole is None or similar is None:
+        raise InputError(f"{render_path}: expected an image of some size, got {size}")
+    static_db = None
+    if has_masks:
+        static = np.ones(size[::-1], bool)
+        if moving is not None:
+            static = np.asarray(cv2.resize(moving, size, interpolation=cv2.INTER_NEAREST)) <= 127
+        if static.sum() > MIN_STATIC_PX:
+            static_db = psnr(splat, photograph, static)
+    capped = None if static_db is None else min(static_db, PSNR_CEILING_DB)
+    return HoldoutError(frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped)
+
+
+def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
+    if not holdout:
+        return
+    metrics["holdout_frames"] = len(holdout)
+    metrics["psnr_holdout"] = float(np.mean([h.psnr_db for h in holdout]))
+    metrics["ssim_holdout"] = float(np.mean([h.ssim for h in holdout]))
+    static = [h.psnr_static_db for h in holdout if h.psnr_static_db is not None]
+    if static:
+        metrics["psnr_holdout_static"] = float(np.mean(static))
+
+
+def _masks(run_dir: Path, stamps: list[str], moving: dict[str, str]) -> MaskError:
+    present = {p.stem for p in (run_dir / "masks").glob("*.png")}
+    return mask_error(
+        (read_mask(run_dir / "masks" / f"{s}.png"), read_mask(moving[s]) if s in moving else None)
+        for s in stamps
+        if s in present
+    )
+
+
+def _add_masks(metrics: dict[str, Any], masks: MaskError, has_truth: bool) -> None:
+    """Without true masks nobody knows what moves: then only the share called moving is a figure."""
+    if not masks.n_frames:
+        return
+    metrics["mask_moving_ratio"] = masks.called_moving_ratio
+    if has_truth:
+        metrics["mask_iou"] = masks.iou
+        metrics["mask_false_positive_ratio"] = masks.false_positive_ratio

@@ -1,0 +1,71 @@
+"""Writing files so that a reader never sees half of one, and a full disk is one clear line."""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import OutputError
+
+REMEDY = {
+    errno.ENOSPC: "free some space or choose another folder with --out",
+    errno.EDQUOT: "the quota is used up: free some space or choose another folder with --out",
+    errno.EACCES: "allow writing there or choose another folder with --out",
+    errno.EPERM: "allow writing there or choose another folder with --out",
+    errno.EROFS: "the file system is read-only: choose another folder with --out",
+}
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an OSError of the body into an OutputError that says the path and what to do."""
+    try:
+        yield
+    except OSError as e:
+        remedy = REMEDY.get(e.errno or 0, "choose another folder with --out")
+        raise OutputError(f"{path}: expected to write, got {e.strerror or e}; {remedy}") from e
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all: a temporary beside it, then a rename. Raises OutputError."""
+    temporary = path.with_name(path.name + ".part")
+    with writing(path):
+        try:
+            with open(temporary, "wb") as file:
+                file.write(data)
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """``write_bytes`` in UTF-8."""
+    write_bytes(path, text.encode())
+
+
+def write_json(path: Path, data: dict[str, Any]) -> None:
+    """``write_text`` of indented JSON; numpy values become plain ones, non-finite numbers become null."""
+    write_text(path, json.dumps(plain(data), indent=2, allow_nan=False) + "\n")
+
+
+def plain(value: Any) -> Any:
+    """The same value in JSON's own types."""
+    if isinstance(value, dict):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,69 @@
+"""How the figures of metrics.json are named and written for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+# key -> (what it is, number format, unit)
+NAMES: dict[str, tuple[str, str, str]] = {
+    "frames": ("Frames read", "d", ""),
+    "frames_posed": ("Frames with a pose", "d", ""),
+    "keyframes": ("Keyframes", "d", ""),
+    "ate_rmse_all": ("ATE, all frames (RMSE after Sim(3))", ".4f", "m"),
+    "ate_rmse_keyframes": ("ATE, keyframes", ".4f", "m"),
+    "holdout_frames": ("Holdout frames", "d", ""),
+    "psnr_holdout": ("PSNR, holdout frames", ".2f", "dB"),
+    "psnr_holdout_static": ("PSNR, holdout frames, static pixels", ".2f", "dB"),
+    "psnr_mapped": ("PSNR, mapped frames", ".2f", "dB"),
+    "ssim_holdout": ("SSIM, holdout frames", ".3f", ""),
+    "mask_iou": ("Mask IoU at P > 0.5", ".3f", ""),
+    "mask_false_positive_ratio": ("Static pixels called moving", ".2%", ""),
+    "mask_moving_ratio": ("Pixels called moving", ".2%", ""),
+    "fps_tracking": ("Tracking speed", ".2f", "frames/s"),
+    "fps_total": ("Speed of the whole run", ".2f", "frames/s"),
+    "peak_rss_mib": ("Peak memory", ".0f", "MiB"),
+    "focal_px": ("Focal length at full width", ".1f", "px"),
+    "gaussians": ("Gaussians", ",d", ""),
+}
+
+
+def described(key: str) -> str:
+    """What a figure is, in words; an unknown key as it stands."""
+    if key in NAMES:
+        return NAMES[key][0]
+    if key.endswith("_note"):
+        return f"Why no {described(key.removesuffix('_note'))}"
+    return key.replace("_", " ")
+
+
+def in_order(metrics: Mapping[str, Any]) -> list[tuple[str, Any]]:
+    """The figures in the order of NAMES; a note follows its figure, unknown keys come last as they stand."""
+    order = {key: i for i, key in enumerate(NAMES)}
+    return sorted(metrics.items(), key=lambda item: order.get(item[0].removesuffix("_note"), len(order)))
+
+
+def shown(key: str, value: Any) -> str:
+    """A figure with its unit; a dash where there is none."""
+    if value is None:
+        return "–"
+    _, form, unit = NAMES.get(key, ("", "", ""))
+    if isinstance(value, bool | str):
+        return str(value)
+    if not form:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+    number = int(value) if form.endswith("d") else value
+    return f"{number:{form}} {unit}".rstrip()
+
+
+def summary_line(metrics: Mapping[str, Any]) -> str:
+    """The run in one line."""
+    parts = []
+    if metrics.get("frames"):
+        parts.append(f"{metrics.get('frames_posed', 0)} of {metrics['frames']} frames posed")
+    short = {"ate_rmse_all": "ATE", "psnr_holdout": "PSNR", "mask_iou": "mask IoU"}
+    short |= {"fps_total": "", "peak_rss_mib": ""}
+    for key, name in short.items():
+        if metrics.get(key) is not None:
+            parts.append(f"{name} {shown(key, metrics[key])}".strip())
+    return " · ".join(parts)

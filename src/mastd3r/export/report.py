@@ -1,0 +1,213 @@
+"""report.html: one page that shows a run, pictures first. It needs no network and no other file."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import Trajectory
+from .files import write_text
+from .metric_names import described, in_order, shown, summary_line
+from .pictures import DIFFERENCE_FULL_SCALE, data_uri, difference, fitted, mask_overlay
+from .plots import over_time, timing_bars, top_view
+
+Array = NDArray[Any]
+OVERLAY_WIDTH_PX = 480
+
+
+@dataclass(frozen=True)
+class MaskSample:
+    """One photograph and what was thought to move in it."""
+
+    timestamp_s: float
+    image: Array  # (h, w, 3) uint8 RGB
+    probability: Array  # (h', w') uint8, P(moving) * 255
+
+
+@dataclass(frozen=True)
+class RenderSample:
+    """One holdout view: the photograph at the render's size, and the splat."""
+
+    label: str  # "best", "median", "worst"
+    timestamp_s: float
+    photograph: Array  # (h, w, 3) uint8 RGB
+    splat: Array  # (h, w, 3) uint8 RGB
+    psnr_db: float
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """All that the page shows. Positions are in ``unit``, axes of the first camera."""
+
+    title: str
+    trajectory: Trajectory
+    positions: Array  # (n, 3) float64
+    truth: Array | None  # (n, 3) float64, NaN where a frame has none; None without truth
+    unit: str  # "m" where truth gives the scale, otherwise "map units"
+    renders: tuple[RenderSample, ...]
+    masks: tuple[MaskSample, ...]
+    metrics: Mapping[str, Any]
+    record: Mapping[str, Any]  # run.json
+    config: str  # YAML text
+
+
+def write_report(run_dir: Path, data: ReportData) -> Path:
+    """Write report.html into the run folder; gives its path. Raises OutputError."""
+    path = run_dir / "report.html"
+    write_text(path, report_html(data))
+    return path
+
+
+def report_html(data: ReportData) -> str:
+    """The page as text."""
+    template = Template(files(__package__).joinpath("report_template.html").read_text(encoding="utf-8"))
+    sections = [
+        _renders(data.renders),
+        _masks(data.masks),
+        _trajectory(data),
+        _numbers(data.metrics),
+        _timings(data.record.get("timings_s") or {}),
+        _choices(data),
+    ]
+    return template.substitute(
+        title=escape(data.title),
+        summary=escape(summary_line(data.metrics)),
+        banner=_banner(data.record),
+        sections="\n".join(s for s in sections if s),
+    )
+
+
+def _banner(record: Mapping[str, Any]) -> str:
+    if record.get("status") != "incomplete":
+        return ""
+    reason = escape(str(record.get("reason") or "no reason recorded"))
+    return f'<p class="banner"><b>Incomplete run.</b> {reason}</p>'
+
+
+def _section(title: str, text: str, body: str) -> str:
+    note = f"<p>{text}</p>" if text else ""
+    return f"<section><h2>{title}</h2>{note}{body}</section>"
+
+
+def _figure(image: Array, caption: str, alt: str) -> str:
+    height, width = image.shape[:2]
+    picture = f'<img src="{data_uri(image)}" alt="{escape(alt)}" width="{width}" height="{height}">'
+    return f"<figure>{picture}<figcaption>{caption}</figcaption></figure>"
+
+
+def _scale_bar(kind: str, high: str) -> str:
+    return f'<span class="nowrap">0<span class="{kind}"></span>{high}</span>'
+
+
+def _renders(samples: Sequence[RenderSample]) -> str:
+    if not samples:
+        return ""
+    rows = []
+    for s in samples:
+        rows.append(
+            f'<div class="caption"><b>{escape(s.label.capitalize())}</b> of the holdout views · '
+            f"{s.psnr_db:.1f} dB · at {s.timestamp_s:.3f} s</div>"
+            '<div class="row three">'
+            + _figure(s.photograph, "photograph", f"photograph at {s.timestamp_s:.3f} s")
+            + _figure(s.splat, "splat", f"splat at {s.timestamp_s:.3f} s")
+            + _figure(difference(s.photograph, s.splat), "difference", f"difference at {s.timestamp_s:.3f} s")
+            + "</div>"
+        )
+    text = (
+        "Frames that the map was never shown, and the map seen from their poses. Difference: "
+        f"{_scale_bar('heat', f'{DIFFERENCE_FULL_SCALE:.0%}')} of the range or more. "
+        "Where something moved, photograph and splat are meant to differ."
+    )
+    return _section("Photograph, splat, difference", text, "".join(rows))
+
+
+def _masks(samples: Sequence[MaskSample]) -> str:
+    if not samples:
+        return ""
+    figures = []
+    for s in samples:
+        picture = mask_overlay(fitted(s.image, OVERLAY_WIDTH_PX), s.probability)
+        ratio = float((s.probability > 127).mean())
+        caption = f"<b>{s.timestamp_s:.3f} s</b> · {ratio:.1%} called moving"
+        figures.append(_figure(picture, caption, f"P(moving) over the frame at {s.timestamp_s:.3f} s"))
+    text = f"P(moving) over the photograph: {_scale_bar('heat moving', '1')}, with P = 0.5 outlined in white."
+    return _section("What moves", text, f'<div class="row cells">{"".join(figures)}</div>')
+
+
+def _trajectory(data: ReportData) -> str:
+    if len(data.trajectory.timestamps_s) == 0:
+        return _section("Trajectory", "No frame has a pose.", "")
+    error = None if data.truth is None else np.linalg.norm(data.positions - data.truth, axis=1)
+    shared = (data.trajectory, data.positions, data.truth, data.unit, error)
+    keyframes = int(data.trajectory.is_keyframe.sum())
+    text = f"{len(data.positions)} poses, {keyframes} of them keyframes. "
+    if data.truth is not None:
+        text += (
+            "Scaled and turned to fit truth (Sim(3), all frames); the view from above is coloured by error."
+        )
+    else:
+        text += "A single camera cannot tell the scale: lengths are map units."
+    legend = _legend(data, error is not None)
+    return _section("Trajectory", text, top_view(*shared) + over_time(*shared) + legend)
+
+
+def _legend(data: ReportData, has_truth: bool) -> str:
+    entries = [("tracked", "tracked")]
+    entries += [(s, s) for s in ("interpolated", "lost") if s in data.trajectory.states]
+    entries += [("truth", "truth")] if has_truth else []
+    items = [f'<span><i style="background:var(--{colour})"></i>{name}</span>' for colour, name in entries]
+    items.append('<span><i class="round"></i>keyframe</span>')
+    items.append("<span>wedges: where the camera looks</span>")
+    return f'<div class="legend">{"".join(items)}</div>'
+
+
+def _numbers(metrics: Mapping[str, Any]) -> str:
+    if not metrics:
+        return ""
+    rows = [
+        f"<tr><td>{escape(described(key))}</td>{_value_cell(key, value)}</tr>"
+        for key, value in in_order(metrics)
+    ]
+    half = (len(rows) + 1) // 2
+    tables = "".join(f"<table>{''.join(part)}</table>" for part in (rows[:half], rows[half:]) if part)
+    return _section("Figures", "", f'<div class="row two">{tables}</div>')
+
+
+def _value_cell(key: str, value: Any) -> str:
+    kind = "value text" if isinstance(value, str) else "value"
+    return f'<td class="{kind}">{escape(shown(key, value))}</td>'
+
+
+def _timings(timings_s: Mapping[str, float]) -> str:
+    return _section("Time of each stage", "", timing_bars(dict(timings_s))) if timings_s else ""
+
+
+def _choices(data: ReportData) -> str:
+    record = data.record
+    parts = []
+    choices = record.get("choices") or []
+    if choices:
+        parts.append("<ul>" + "".join(f"<li>{escape(str(c))}</li>" for c in choices) + "</ul>")
+    command = record.get("command") or []
+    if command:
+        parts.append(f"<pre>{escape(shlex.join(map(str, command)))}</pre>")
+    machine = record.get("machine") or {}
+    packages = machine.get("packages") or {}
+    facts = {k.replace("_", " "): v for k, v in machine.items() if k != "packages" and v is not None}
+    facts |= {k: record[k] for k in ("started", "finished", "status") if record.get(k)}
+    facts |= {"packages": ", ".join(f"{k} {v}" for k, v in packages.items() if v)} if packages else {}
+    rows = "".join(f"<tr><td>{escape(k)}</td><td>{escape(str(v))}</td></tr>" for k, v in facts.items())
+    if rows:
+        parts.append(f"<details><summary>Machine and versions</summary><table>{rows}</table></details>")
+    if data.config:
+        parts.append(f"<details><summary>Configuration</summary><pre>{escape(data.config)}</pre></details>")
+    return _section("Choices made", "", "".join(parts)) if parts else ""

@@ -1,0 +1,171 @@
+"""The run folder: the one place where a run's files are written."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Sequence
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OutputError
+from ..geometry.camera import Camera
+from ..types import StaticCloud, Trajectory
+from .files import write_bytes, write_json, write_text, writing
+from .machine import machine_info
+from .point_cloud import write_cloud
+from .trajectory_files import write_tum
+
+Array = NDArray[Any]
+FILES = (
+    "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply",
+    "metrics.json", "report.html",
+)  # fmt: skip
+FOLDERS = ("masks", "renders")
+RESERVE_BYTES = 2**20  # given back when the disk is full, so that the end of a run can still be written
+
+
+def stamp(timestamp_s: float) -> str:
+    """A timestamp as file names and trajectory rows write it: six decimals."""
+    return f"{timestamp_s:.6f}"
+
+
+class RunFolder:
+    """A folder that holds one run. ``run.json`` says "running" until ``finish``.
+
+    Raises OutputError for a folder that is not empty and holds no run.json, and for whatever the system
+    refuses. Files of an earlier run are removed first; files that no run writes are left alone.
+    """
+
+    def __init__(self, path: Path | str, command: Sequence[str] = ()) -> None:
+        self.path = Path(path)
+        self._reserve = self.path / ".reserve"
+        self._prepare()
+        self.record: dict[str, Any] = {
+            "status": "running",
+            "reason": None,
+            "command": list(command),
+            "started": _now(),
+            "finished": None,
+            "machine": machine_info(),
+            "choices": [],
+            "timings_s": {},
+        }
+        write_bytes(self._reserve, os.urandom(RESERVE_BYTES))
+        self._save()
+
+    def update(self, **fields: Any) -> None:
+        """Add fields to run.json, or replace them."""
+        self.record.update(fields)
+        self._save()
+
+    def note(self, *choices: str) -> None:
+        """Add lines to the choices made in run.json, each once."""
+        self.record["choices"] += [c for c in dict.fromkeys(choices) if c not in self.record["choices"]]
+        self._save()
+
+    def finish(self, status: str = "complete", reason: str | None = None) -> None:
+        """Close the run: ``complete``, or ``incomplete`` with the reason in one line."""
+        if status not in {"complete", "incomplete"} or (status == "incomplete") != bool(reason):
+            raise ValueError(f"expected complete, or incomplete with a reason; got {status!r}, {reason!r}")
+        self.make_room()
+        self.update(status=status, reason=reason, finished=_now())
+
+    def make_room(self) -> None:
+        """Give back the reserved space, for the last small files on a full disk."""
+        with suppress(OSError):
+            self._reserve.unlink()
+
+    def write_config(self, yaml_text: str) -> None:
+        """config.yaml: the effective configuration."""
+        write_text(self.path / "config.yaml", yaml_text)
+
+    def write_trajectory(self, trajectory: Trajectory) -> None:
+        """trajectory.txt and keyframes.txt; how frames came by their poses goes to run.json."""
+        write_tum(self.path / "trajectory.txt", trajectory)
+        write_tum(self.path / "keyframes.txt", trajectory.keyframes())
+        pairs = zip(trajectory.states, trajectory.world_from_cam, strict=True)
+        states = [state for state, pose in pairs if np.isfinite(pose).all()]
+        self.update(states=_run_lengths(states))
+
+    def write_camera(self, camera: Camera) -> None:
+        """camera.json: the lens, in pixels of the full-size image."""
+        self.write_json("camera.json", dataclasses.asdict(camera))
+
+    def write_cloud(self, cloud: StaticCloud) -> None:
+        """cloud.ply: the dense static map."""
+        write_cloud(self.path / "cloud.ply", cloud)
+
+    def write_mask(self, timestamp_s: float, probability: Array) -> None:
+        """masks/<timestamp>.png: P(moving), (h, w) in 0..1. A value above 127 is P > 0.5."""
+        if probability.ndim != 2 or not np.isfinite(probability).all():
+            raise OutputError(
+                f"mask at {stamp(timestamp_s)} s: expected finite (h, w) probabilities, got shape "
+                f"{probability.shape}, {int((~np.isfinite(probability)).sum())} not finite"
+            )
+        levels = np.ceil(np.clip(probability, 0, 1) * 255 - 0.5).astype(np.uint8)
+        self._write_png("masks", timestamp_s, levels)
+
+    def write_render(self, timestamp_s: float, image: Array) -> None:
+        """renders/<timestamp>.png: (h, w, 3) RGB, uint8 or float in 0..1."""
+        if image.dtype != np.uint8:
+            if not np.isfinite(image).all():
+                raise OutputError(
+                    f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not"
+                )
+            image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+        self._write_png("renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
+
+    def write_metrics(self, metrics: dict[str, Any]) -> None:
+        """metrics.json: flat keys."""
+        self.write_json("metrics.json", metrics)
+
+    def write_json(self, name: str, data: dict[str, Any]) -> None:
+        """Any other small file of the run."""
+        write_json(self.path / name, data)
+
+    def _write_png(self, folder: str, timestamp_s: float, image: Array) -> None:
+        path = self.path / folder / f"{stamp(timestamp_s)}.png"
+        done, data = cv2.imencode(".png", image)
+        if not done:
+            raise OutputError(f"{path}: expected an image that PNG can hold, got shape {image.shape}")
+        write_bytes(path, data.tobytes())
+
+    def _prepare(self) -> None:
+        with writing(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            if any(self.path.iterdir()) and not (self.path / "run.json").is_file():
+                raise OutputError(
+                    f"{self.path}: expected an empty folder or an earlier run, got a folder with other files "
+                    f"and no run.json; choose another with --out"
+                )
+            for name in FILES:
+                (self.path / name).unlink(missing_ok=True)
+            for name in FOLDERS:
+                (self.path / name).mkdir(exist_ok=True)
+                for old in (self.path / name).glob("*.png"):
+                    old.unlink()
+
+    def _save(self) -> None:
+        write_json(self.path / "run.json", self.record)
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _run_lengths(states: Sequence[str]) -> list[list[Any]]:
+    """["a", "a", "b"] to [["a", 2], ["b", 1]]."""
+    runs: list[list[Any]] = []
+    for state in states:
+        if runs and runs[-1][0] == state:
+            runs[-1][1] += 1
+        else:
+            runs.append([state, 1])
+    return runs
