@@ -1,1 +1,6 @@
-"""Where frames come from: video files, image folders, TUM-layout folders, a synthetic room."""
+"""Where frames come from: videos, image folders, TUM-layout folders, and a room made in memory."""
+
+from .checks import frame_is_blank
+from .open import OpenedSource, open_source
+
+__all__ = ["OpenedSource", "frame_is_blank", "open_source"]

@@ -1,0 +1,100 @@
+"""Reading single files: photographs, depth maps and probability maps."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from ..errors import InputError
+
+Array = NDArray[Any]
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+MAP_SUFFIXES = (".png", ".npy")
+_BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+
+
+def read_rgb(path: Path) -> Array:
+    """An image file as upright (h, w, 3) uint8 RGB. Raises InputError.
+
+    EXIF orientation is applied; grey is repeated, alpha dropped, 16-bit grey divided by 257.
+    """
+    image = _opened(path, "a readable image")
+    if image.mode.startswith("I"):  # Pillow's modes of 16-bit grey files
+        grey = _grey_levels(image, path)
+        image = Image.fromarray(grey)
+    return np.array(image.convert("RGB"))  # a copy of its own, writable
+
+
+def read_depth_m(path: Path, units_per_metre: float) -> tuple[Array, int]:
+    """A depth file as (h, w) float32 metres, 0 = none, and the number of values that were not finite.
+
+    Integer files hold metres times ``units_per_metre``; float files (.npy, 32-bit float images) hold metres.
+    Values that are not finite, or negative, become 0. Raises InputError.
+    """
+    raw = _map_values(path, "a depth map")
+    depth = raw.astype(np.float32)
+    if raw.dtype.kind in "iu":
+        return np.maximum(depth / np.float32(units_per_metre), 0), 0
+    finite = np.isfinite(depth)
+    return np.where(finite & (depth > 0), depth, np.float32(0)), int(np.count_nonzero(~finite))
+
+
+def read_probability(path: Path) -> Array:
+    """A map of P(movable thing) as (h, w) float32 in 0..1. Raises InputError.
+
+    8-bit files are divided by 255, 16-bit ones by 65535; float .npy files are taken as they are.
+    """
+    raw = _map_values(path, "a probability map")
+    if raw.dtype == np.bool_:
+        return raw.astype(np.float32)
+    if raw.dtype.kind in "iu":
+        top = 255 if raw.dtype.itemsize == 1 else 65535
+        raw = raw.astype(np.float32) / np.float32(top)
+    values = raw.astype(np.float32)
+    if not (np.isfinite(values).all() and values.min() >= 0 and values.max() <= 1):
+        raise InputError(f"{path}: expected probabilities in 0..1, got {raw.min():g} .. {raw.max():g}")
+    return values
+
+
+def _opened(path: Path, expected: str) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return ImageOps.exif_transpose(image)
+    except FileNotFoundError as e:
+        raise InputError(f"{path}: expected {expected}, got no such file") from e
+    except _BROKEN as e:
+        raise InputError(f"{path}: expected {expected}, got a broken or unknown file ({e})") from e
+
+
+def _grey_levels(image: Image.Image, path: Path) -> NDArray[np.uint8]:
+    """16-bit grey (modes I;16, I) as 8 bits."""
+    values = np.asarray(image).astype(np.int64)
+    if values.min() < 0 or values.max() > 65535:
+        raise InputError(f"{path}: expected grey levels in 0..65535, got {values.min()} .. {values.max()}")
+    return ((values + 128) // 257).astype(np.uint8)
+
+
+def _map_values(path: Path, expected: str) -> Array:
+    """One number a pixel, as stored, (h, w)."""
+    if path.suffix.lower() == ".npy":
+        try:
+            values: Array = np.load(path, allow_pickle=False)
+        except FileNotFoundError as e:
+            raise InputError(f"{path}: expected {expected}, got no such file") from e
+        except (OSError, ValueError, EOFError) as e:
+            raise InputError(f"{path}: expected {expected} as .npy, got a broken file ({e})") from e
+    else:
+        image = _opened(path, expected)
+        values = np.asarray(image.convert("L") if image.mode in ("P", "LA", "RGB", "RGBA") else image)
+    if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "iufb":
+        raise InputError(
+            f"{path}: expected {expected}, one number a pixel, got {values.dtype} {values.shape}"
+        )
+    return values

@@ -1,0 +1,89 @@
+"""A folder of images as a source."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from ..config import SourceConfig
+from ..errors import InputError
+from ..types import Frame, Truth
+from .checks import check_same_size, window
+from .image_files import IMAGE_SUFFIXES, read_probability, read_rgb
+from .notes import Notes
+from .semantic_maps import match_maps
+
+FOLDER_FPS = 30.0  # image files carry no times; one thirtieth of a second a frame is assumed
+
+
+def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
+    """Sort key under which img2 stands before img10, and capitals do not matter."""
+    parts = re.split(r"(\d+)", name.casefold())
+    return tuple((0, int(p), "") if p.isdecimal() else (1, 0, p) for p in parts if p)
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The image files right in ``folder``, hidden ones left out, in natural order."""
+    found = [
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and p.is_file()
+    ]
+    return sorted(found, key=lambda p: (natural_key(p.name), p.name))
+
+
+class ImageFolderSource:
+    """The images of one folder in natural order, index / 30 s apart."""
+
+    kind = "images"
+    has_depth = False
+
+    def __init__(
+        self,
+        folder: Path,
+        config: SourceConfig,
+        *,
+        want_semantic: bool = True,
+        semantic_dir: Path | None = None,
+    ) -> None:
+        """Lists the folder and reads the first image for its size. Raises InputError, ConfigError."""
+        self.name = folder.resolve().name
+        self._notes = Notes()
+        self.notes: list[str] = self._notes
+        self._files = image_files(folder)
+        if not self._files:
+            raise InputError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), got none")
+        self._chosen = window(config, len(self._files), str(folder))
+        self.length: int | None = len(self._chosen)
+        self._first = self._files[self._chosen[0]]
+        height, width = read_rgb(self._first).shape[:2]
+        self.size = (width, height)
+        self._describe()
+        self._semantic: dict[int, Path] = {}
+        if semantic_dir is not None:
+            stems = {i: self._files[i].stem for i in self._chosen}
+            times = {i: i / FOLDER_FPS for i in self._chosen}
+            self._semantic = match_maps(semantic_dir, stems, times, self._notes)
+        self.has_semantic = bool(self._semantic)
+        self._want_semantic = want_semantic
+
+    def frames(self) -> Iterator[Frame]:
+        """One image after another. Raises InputError at a file that is unreadable or of another size."""
+        for i in self._chosen:
+            image = read_rgb(self._files[i])
+            check_same_size(image, str(self._files[i]), self.size, str(self._first))
+            semantic = None
+            if self._want_semantic and i in self._semantic:
+                semantic = read_probability(self._semantic[i])
+            yield Frame(i, i / FOLDER_FPS, image, semantic=semantic)
+
+    def truth(self) -> Truth | None:
+        """A folder of images knows nothing about itself."""
+        return None
+
+    def _describe(self) -> None:
+        self._notes.put("times", f"images carry no times: {FOLDER_FPS:g} frames a second assumed")
+        kinds = sorted({p.suffix.lower() for p in self._files})
+        if len(kinds) > 1:
+            self._notes.put("kinds", f"images of several kinds are read as one sequence: {', '.join(kinds)}")

@@ -1,0 +1,208 @@
+"""A folder in the TUM RGB-D layout as a source."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..config import SourceConfig
+from ..errors import InputError
+from ..types import Frame, Truth
+from .checks import check_same_size, window
+from .image_files import read_depth_m, read_probability, read_rgb
+from .notes import Notes
+from .semantic_maps import match_maps, nearest_time
+
+Array = NDArray[Any]
+TUM_DEPTH_SCALE = 5000.0  # units of a 16-bit depth file a metre, where info.json does not tell
+
+
+@dataclass(frozen=True)
+class _Row:
+    line: int  # counted from 1, for messages
+    timestamp_s: float
+    words: tuple[str, ...]
+
+
+class TumSource:
+    """Colour, depth, semantic maps and truth of one TUM-layout folder, associated by time."""
+
+    kind = "tum"
+
+    def __init__(
+        self,
+        folder: Path,
+        config: SourceConfig,
+        *,
+        want_depth: bool = False,
+        want_semantic: bool = True,
+        semantic_dir: Path | None = None,
+    ) -> None:
+        """Reads the lists, checks that the listed images exist. Raises InputError, ConfigError."""
+        self.name = folder.resolve().name
+        self._notes = Notes()
+        self.notes: list[str] = self._notes
+        self._folder = folder
+        self._info = _read_info(folder / "info.json")
+        self._rows = _file_rows(folder / "rgb.txt")
+        _check_ascending(self._rows, folder / "rgb.txt")
+        self._chosen = window(config, len(self._rows), str(folder / "rgb.txt"))
+        self.length: int | None = len(self._chosen)
+        self._times = np.array([r.timestamp_s for r in self._rows])
+        for i in self._chosen:
+            if not self._image(i).is_file():
+                row = self._rows[i]
+                raise InputError(
+                    f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}"
+                )
+        height, width = read_rgb(self._image(self._chosen[0])).shape[:2]
+        self.size = (width, height)
+        self._depth = self._associated("depth.txt")
+        self._depth_scale = self._units_per_metre() if self._depth else TUM_DEPTH_SCALE
+        if semantic_dir is not None:
+            stems = {i: self._image(i).stem for i in self._chosen}
+            times = {i: float(self._times[i]) for i in self._chosen}
+            self._semantic = match_maps(semantic_dir, stems, times, self._notes)
+        else:
+            self._semantic = self._associated("semantic.txt")
+        self.has_depth, self.has_semantic = bool(self._depth), bool(self._semantic)
+        self._want_depth, self._want_semantic = want_depth, want_semantic
+
+    def frames(self) -> Iterator[Frame]:
+        """Frame after frame; depth and semantic only if wanted. Raises InputError at an unreadable file."""
+        holes = 0
+        first = str(self._image(self._chosen[0]))
+        for i in self._chosen:
+            image = read_rgb(self._image(i))
+            check_same_size(image, str(self._image(i)), self.size, first)
+            depth, semantic = None, None
+            if self._want_depth and i in self._depth:
+                depth, bad = read_depth_m(self._depth[i], self._depth_scale)
+                check_same_size(depth, str(self._depth[i]), self.size, f"its image {self._image(i).name}")
+                holes += bad
+                if bad:
+                    self._notes.put("holes", f"depth: {holes} values that are not finite are taken as none")
+            if self._want_semantic and i in self._semantic:
+                semantic = read_probability(self._semantic[i])
+            yield Frame(i, float(self._times[i]), image, depth, semantic)
+
+    def truth(self) -> Truth | None:
+        """Poses of groundtruth.txt, masks of mask.txt, focal length of info.json. Raises InputError.
+
+        Masks are keyed by the timestamp of the frame that they belong to. None where the folder has none of
+        the three.
+        """
+        times, poses = _read_poses(self._folder / "groundtruth.txt")
+        moving = {float(self._times[i]): str(p) for i, p in self._associated("mask.txt").items()}
+        focal = self._number("fx")
+        if len(times) == 0 and not moving and focal is None:
+            return None
+        return Truth(times, poses, moving, focal)
+
+    def _image(self, i: int) -> Path:
+        return self._folder / self._rows[i].words[0]
+
+    def _associated(self, list_name: str) -> dict[int, Path]:
+        """Frame index -> file of a list such as depth.txt, by nearest time within 20 ms."""
+        path = self._folder / list_name
+        if not path.is_file():
+            return {}
+        rows = sorted(_file_rows(path), key=lambda r: r.timestamp_s)
+        at = nearest_time(np.array([r.timestamp_s for r in rows]), self._times[list(self._chosen)])
+        found = {i: self._folder / rows[k].words[0] for i, k in zip(self._chosen, at, strict=True) if k >= 0}
+        self._notes.put(list_name, f"{list_name}: belongs to {len(found)} of {len(self._chosen)} frames")
+        return found
+
+    def _units_per_metre(self) -> float:
+        scale = self._number("depth_scale")
+        if scale is None:
+            self._notes.put(
+                "scale", f"info.json tells no depth_scale: {TUM_DEPTH_SCALE:g} units a metre assumed"
+            )
+            return TUM_DEPTH_SCALE
+        return scale
+
+    def _number(self, key: str) -> float | None:
+        value = self._info.get(key)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
+            raise InputError(f"{self._folder / 'info.json'}: expected {key} above 0, got {value!r}")
+        return float(value)
+
+
+def _read_info(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as e:
+        raise InputError(f"{path}: expected JSON, got {e}") from e
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected a JSON object, got {type(data).__name__}")
+    return data
+
+
+def _rows_of(path: Path, words: int, what: str) -> list[_Row]:
+    """Lines of a TUM list: a time, then ``words`` words (1: the rest of the line). Raises InputError."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: expected a readable text file, got {e}") from e
+    rows: list[_Row] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        parts = re.split(r"[,\s]+", line.strip(), maxsplit=1 if words == 1 else 0)
+        try:
+            time_s = float(parts[0])
+        except ValueError:
+            time_s = np.nan
+        if len(parts) < words + 1 or not np.isfinite(time_s):
+            raise InputError(f"{path} line {number}: expected '{what}', got {line.strip()!r}")
+        rows.append(_Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
+    if not rows:
+        raise InputError(f"{path}: expected lines of '{what}', got none")
+    return rows
+
+
+def _file_rows(path: Path) -> list[_Row]:
+    return _rows_of(path, 1, "timestamp_s filename")
+
+
+def _check_ascending(rows: list[_Row], path: Path) -> None:
+    for before, row in pairwise(rows):
+        if row.timestamp_s <= before.timestamp_s:
+            raise InputError(
+                f"{path} line {row.line}: expected a time after {before.timestamp_s:.6f} s "
+                f"(line {before.line}), got {row.timestamp_s:.6f} s"
+            )
+
+
+def _read_poses(path: Path) -> tuple[Array, Array]:
+    """groundtruth.txt as (n,) float64 ascending seconds and (n, 4, 4) float64 world_from_cam; n may be 0."""
+    if not path.is_file():
+        return np.empty(0), np.empty((0, 4, 4))
+    layout = "timestamp_s tx ty tz qx qy qz qw"
+    rows = sorted(_rows_of(path, 7, layout), key=lambda r: r.timestamp_s)
+    values = np.empty((len(rows), 7))
+    for k, row in enumerate(rows):
+        try:
+            values[k] = [float(w) for w in row.words]
+        except ValueError:
+            values[k] = np.nan
+        if not np.isfinite(values[k]).all() or np.linalg.norm(values[k, 3:]) < 1e-6:
+            raise InputError(f"{path} line {row.line}: expected '{layout}', got {' '.join(row.words)!r}")
+    world_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
+    world_from_cam[:, :3, 3] = values[:, :3]
+    world_from_cam[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+    return np.array([r.timestamp_s for r in rows]), world_from_cam

@@ -1,0 +1,330 @@
+"""A video file as a source, decoded by PyAV one frame at a time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from ..config import SourceConfig
+from ..errors import InputError
+from ..types import Frame, Truth
+from .checks import check_same_size, check_window, window
+from .image_files import read_probability
+from .notes import Notes
+from .semantic_maps import match_maps
+
+Array = NDArray[Any]
+Turn = tuple[int, int, int, int]  # row-major 2x2 of 0, 1, -1: (x, y) as stored to (x, y) as shown
+UPRIGHT: Turn = (1, 0, 0, 1)
+FALLBACK_FPS = Fraction(30)
+
+
+@dataclass(frozen=True)
+class _Contents:
+    """What the file's packets say, before anything is decoded."""
+
+    times_s: Array  # (n,) float64 ascending presentation times, one a packet
+    timed: bool  # the file has presentation times; else they are counted
+    frame_s: float  # usual (median) time between frames
+    cut_before_s: float | None  # the end that the header promises, where the file stops before it
+    doubtful: int | None  # presentation stamp of a last packet that may be only half there
+    pixel_aspect: Fraction  # width of a pixel over its height
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    index: int
+    timestamp_s: float
+    frame: Any  # av.VideoFrame
+
+
+@dataclass(frozen=True)
+class _Loss:
+    """A packet that does not decode."""
+
+    timestamp_s: float | None
+
+
+def turn_of(display_matrix: bytes) -> Turn:
+    """Nearest turn by quarters (with mirroring) of a 3x3 display matrix: nine int32, 16.16 fixed point.
+
+    The file stores [a b u; c d v; x y w] for x' = a x + c y, y' = b x + d y (ISO/IEC 14496-12, tkhd).
+    """
+    a, b, _, c, d = np.frombuffer(display_matrix, np.int32)[:5].astype(np.int64)
+    if max(abs(a), abs(d)) >= max(abs(b), abs(c)):
+        return (-1 if a < 0 else 1, 0, 0, -1 if d < 0 else 1)
+    return (0, -1 if c < 0 else 1, -1 if b < 0 else 1, 0)
+
+
+def turned(image: Array, turn: Turn) -> Array:
+    """(h, w, 3) as stored to (h, w, 3) or (w, h, 3) as shown."""
+    if turn[0] == 0:
+        image = image.transpose(1, 0, 2)
+    if turn[0] + turn[1] < 0:
+        image = image[:, ::-1]
+    if turn[2] + turn[3] < 0:
+        image = image[::-1]
+    return np.ascontiguousarray(image)
+
+
+class VideoSource:
+    """The frames of one video file at their true presentation times, upright."""
+
+    kind = "video"
+    has_depth = False
+
+    def __init__(
+        self,
+        path: Path,
+        config: SourceConfig,
+        *,
+        want_semantic: bool = True,
+        semantic_dir: Path | None = None,
+    ) -> None:
+        """Reads the packets' times and decodes the first frame. Raises InputError, ConfigError."""
+        check_window(config)
+        self.name = path.stem
+        self._notes = Notes()
+        self.notes: list[str] = self._notes
+        self._path = path
+        self._contents = _read_contents(path)
+        count = len(self._contents.times_s)
+        self._chosen = window(config, count, str(path))
+        self.length: int | None = len(self._chosen)
+        first = next(self._decoded(note_end=False), None)
+        if first is None:
+            raise InputError(f"{path}: expected a video, got {count} frames of which none can be decoded")
+        self._turn = _turn_of_frame(first.frame)
+        height, width = self._rgb(first.frame).shape[:2]
+        self.size = (width, height)
+        self._semantic: dict[int, Path] = {}
+        if semantic_dir is not None:
+            times = {i: float(self._contents.times_s[i]) for i in self._chosen}
+            self._semantic = match_maps(semantic_dir, {}, times, self._notes)
+        self.has_semantic = bool(self._semantic)
+        self._want_semantic = want_semantic
+
+    def frames(self) -> Iterator[Frame]:
+        """Frame after frame. Broken ones are left out and noted. Raises InputError where the size changes."""
+        given = 0
+        for d in self._decoded(note_end=True):
+            if d.index not in self._chosen:
+                continue
+            image = self._rgb(d.frame)
+            where = f"{self._path} frame {d.index} at {d.timestamp_s:.3f} s"
+            check_same_size(image, where, self.size, "the first frame")
+            semantic = None
+            if self._want_semantic and d.index in self._semantic:
+                semantic = read_probability(self._semantic[d.index])
+            given += 1
+            yield Frame(d.index, d.timestamp_s, image, semantic=semantic)
+        self.length = given
+
+    def truth(self) -> Truth | None:
+        """A video knows nothing about itself."""
+        return None
+
+    def _rgb(self, frame: Any) -> Array:
+        """The decoded frame as it is shown: square pixels, upright, (h, w, 3) uint8."""
+        aspect = self._contents.pixel_aspect
+        width = round(frame.width * aspect)
+        if width != frame.width:
+            self._notes.put(
+                "aspect", f"pixels are {aspect} as wide as high: stretched to {width}x{frame.height}"
+            )
+            frame = frame.reformat(width=width, height=frame.height, format="rgb24")
+        image: Array = frame.to_ndarray(format="rgb24")
+        if self._turn != UPRIGHT:
+            self._notes.put("turn", "turned upright as the video's rotation metadata says")
+        return turned(image, self._turn)
+
+    def _decoded(self, note_end: bool) -> Iterator[_Decoded]:
+        """All frames that decode whole, from the first of the file to the last of the window.
+
+        From a broken packet's time on, frames are left out up to the next key frame: they build on what is
+        lost.
+        """
+        last: _Decoded | None = None
+        broken_s: list[float] = []
+        building_on_s: float | None = None  # time of the loss that later frames may build on
+        counted = 0
+        with _opened(self._path) as (container, stream):
+            for item in _frames_and_losses(container, stream, self._contents.doubtful):
+                if isinstance(item, _Loss):
+                    at = self._contents.times_s[0] if item.timestamp_s is None else item.timestamp_s
+                    building_on_s = at if building_on_s is None else max(at, building_on_s)
+                    broken_s.append(at)
+                    continue
+                d = self._placed(item, counted)
+                counted += 1
+                if building_on_s is not None and d.timestamp_s >= building_on_s and item.key_frame:
+                    building_on_s = None
+                if item.is_corrupt or (building_on_s is not None and d.timestamp_s >= building_on_s):
+                    broken_s.append(d.timestamp_s)
+                    continue
+                if last is not None and d.timestamp_s <= last.timestamp_s:
+                    self._notes.put("doubled", "frames without a presentation time of their own are left out")
+                    continue
+                if d.index > self._chosen[-1]:
+                    note_end = False
+                    break
+                last = d
+                yield d
+        if broken_s:
+            at, lost = min(broken_s), len(broken_s)
+            self._notes.put("broken", f"video is broken at {at:.3f} s: frames left out because of it: {lost}")
+        if note_end and last is not None:
+            self._note_cut(last)
+
+    def _placed(self, frame: Any, counted: int) -> _Decoded:
+        """Index and time of a frame; in a file without presentation times, by counting."""
+        contents = self._contents
+        if not contents.timed or frame.pts is None:
+            return _Decoded(counted, counted * contents.frame_s, frame)
+        t = float(frame.pts * frame.time_base)
+        at = int(np.searchsorted(contents.times_s, t - 1e-6).clip(0, len(contents.times_s) - 1))
+        return _Decoded(at, t, frame)
+
+    def _note_cut(self, last: _Decoded) -> None:
+        """Tell where a file stops before the end that its header promises."""
+        end_s = self._contents.cut_before_s
+        if end_s is None or self._chosen[-1] + self._chosen.step < len(self._contents.times_s):
+            return
+        self._notes.put(
+            "cut",
+            f"video is cut short: it stops after frame {last.index} ({last.timestamp_s:.3f} s), "
+            f"its header promises {end_s:.3f} s",
+        )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """The container and its first real video stream. Raises InputError."""
+    try:
+        container = av.open(str(path.resolve()))
+    except av.FFmpegError as e:
+        raise InputError(f"{path}: {_why_not(path)}") from e
+    with container:
+        if container.format.name == "image2" or container.format.name.endswith("_pipe"):
+            raise InputError(f"{path}: expected a video or a folder of images, got a single image")
+        stream = next((s for s in container.streams.video if not _is_picture(s)), None)
+        if stream is None:
+            raise InputError(
+                f"{path}: expected a video, got a {container.format.name} file without moving pictures"
+            )
+        yield container, stream
+
+
+def _is_picture(stream: Any) -> bool:
+    """Cover art of a sound file, and text that the library would draw, are no video."""
+    return (
+        bool(stream.disposition & av.stream.Disposition.attached_pic) or stream.codec_context.name == "ansi"
+    )
+
+
+def _why_not(path: Path) -> str:
+    with path.open("rb") as f:
+        head = f.read(16)
+    if not head:
+        return "expected a video, got an empty file"
+    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide"):
+        return "expected a whole video, got an mp4/mov file cut short (its index, moov, is missing)"
+    return f"expected a video, a folder of images or a TUM-layout folder, got a file beginning {head[:8]!r}"
+
+
+def _read_contents(path: Path) -> _Contents:
+    """Times of all whole packets, without decoding. Raises InputError."""
+    with _opened(path) as (container, stream):
+        rate = stream.average_rate or stream.guessed_rate or FALLBACK_FPS
+        stamps: list[int | None] = []
+        tail: Any = None
+        for tail in (p for p in _packets(container, stream) if p.size):
+            if not _unshown(tail):
+                stamps.append(tail.pts)
+        if not stamps:
+            raise InputError(f"{path}: expected a video, got a file without a whole frame in it")
+        timed = None not in stamps
+        times = _times_of(stamps, stream.time_base, float(1 / rate))
+        steps = np.diff(times) if len(times) > 1 else np.array([float(1 / rate)])
+        frame_s, end = float(np.median(steps)), _promised_end_s(container, stream)
+        cut = end is not None and end - (times[-1] + frame_s) > max(2 * frame_s, float(steps.max()))
+        doubtful = None
+        if cut and timed and not tail.is_corrupt and len(stamps) > 1:
+            # not every container tells that its last packet is only half there
+            doubtful = stamps.pop()
+            times = _times_of(stamps, stream.time_base, frame_s)
+        aspect = stream.sample_aspect_ratio or Fraction(1)
+        return _Contents(times, timed, frame_s, end if cut else None, doubtful, aspect)
+
+
+def _times_of(stamps: list[int | None], time_base: Fraction, frame_s: float) -> Array:
+    """Ascending seconds; where some packet has no time, all are counted."""
+    known = sorted(p for p in stamps if p is not None)
+    if len(known) < len(stamps):
+        return np.arange(len(stamps)) * frame_s
+    return np.array([float(p * time_base) for p in known])
+
+
+def _promised_end_s(container: Any, stream: Any) -> float | None:
+    """Where the header says that the pictures end; None where it speaks of nothing or of the sound too."""
+    if stream.duration is not None:
+        return float((stream.duration + (stream.start_time or 0)) * stream.time_base)
+    tag = re.fullmatch(r"(\d+):(\d+):(\d+\.?\d*)", stream.metadata.get("DURATION", ""))  # Matroska
+    if tag is not None:
+        return 3600 * int(tag[1]) + 60 * int(tag[2]) + float(tag[3])
+    if container.duration is not None and len(container.streams) == 1:
+        return float(container.duration + (container.start_time or 0)) / av.time_base
+    return None
+
+
+def _unshown(packet: Any) -> bool:
+    return packet.is_corrupt or packet.is_discard
+
+
+def _packets(container: Any, stream: Any) -> Iterator[Any]:
+    """The stream's packets up to the end, or to the place where the file breaks off."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except (StopIteration, av.FFmpegError):
+            return
+        yield packet
+
+
+def _frames_and_losses(container: Any, stream: Any, doubtful: int | None) -> Iterator[Any]:
+    """Decoded frames in presentation order, and a _Loss for each packet that does not decode."""
+    flushed = False
+    for packet in _packets(container, stream):
+        flushed = packet.size == 0
+        loss = _Loss(None if packet.pts is None else float(packet.pts * packet.time_base))
+        if packet.is_corrupt or (doubtful is not None and packet.pts == doubtful):
+            yield loss
+            continue
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            yield loss
+            continue
+        yield from frames
+    if not flushed:  # the file broke off; frames that wait in the decoder are whole
+        try:
+            frames = stream.decode(None)
+        except av.FFmpegError:
+            return
+        yield from frames
+
+
+def _turn_of_frame(frame: Any) -> Turn:
+    """The turn that a frame asks for. Only for the first: a frame whose side data was read is freed late."""
+    matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
+    return UPRIGHT if matrix is None else turn_of(bytes(matrix))
