@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
+from .dynamics.config import DynamicsConfig
 from .errors import ConfigError
 
 PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
@@ -38,6 +39,41 @@ class CameraConfig:
 
 
 @dataclass(frozen=True)
+class TrackingConfig:
+    """What is matched, and when a frame becomes a keyframe (III-B, section 3 of docs/joint_optimisation.md)."""
+
+    area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
+    cell_px: int = 10  # one matched pixel a cell of this size
+    keyframe_motion_ratio: float = 0.08  # median image motion since the keyframe, share of the image width
+    keyframe_overlap_ratio: float = 0.55  # matched share of the keyframe's own matchable pixels, below: new keyframe
+    min_inlier_ratio: float = 0.35  # below: the pose is not believed
+    max_frames_between: int = 60  # a keyframe at least this often while the camera moves
+
+
+@dataclass(frozen=True)
+class AlignmentConfig:
+    """Coarse-to-fine correction of one pair (III-B)."""
+
+    chamfer_weight: float = 0.1  # lambda_cham of eq. (12)
+    min_matches: int = 40  # weighted matches below which a pair cannot be aligned
+
+
+@dataclass(frozen=True)
+class GraphConfig:
+    """Joint optimisation over keyframes."""
+
+    bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
+    neighbours: int = 6  # previous keyframes that a new one is matched with
+    covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with
+    window: int = 8  # keyframes that move in the windowed optimisation
+    window_iterations: int = 4
+    final_iterations: int = 40
+    kernel_px: float = 0.5  # Cauchy scale of the final optimisation
+    loop_overlap_ratio: float = 0.5  # predicted share of points in view that makes an old keyframe a candidate
+    min_match_ratio: float = 0.15  # edges with a smaller matched share are dropped
+
+
+@dataclass(frozen=True)
 class MappingConfig:
     """The Gaussian map (III-C)."""
 
@@ -51,6 +87,8 @@ class MappingConfig:
     hard_weight: bool = False  # True: eq. (14) as printed; False: w = 1 - 0.95 p
     tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
     lambda_uncertainty: float = 0.1  # eq. (17)
+    paper_loss: bool = False  # True: squared error with the weights as printed; False: L1 + 0.2 D-SSIM
+    refine_poses: bool = True  # move the training cameras through the render gradient
 
 
 HOLDOUT_EVERY = 8  # frames 0, 8, 16 … of those read are never shown to the map
@@ -66,6 +104,10 @@ class Config:
     seed: int = 0
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
 
 

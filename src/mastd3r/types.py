@@ -37,7 +37,7 @@ class Truth:
 
     timestamps_s: Array  # (n,) float64
     world_from_cam: Array  # (n, 4, 4) float64; n may be 0
-    moving_files: dict[float, str] = field(default_factory=dict)  # timestamp_s -> 8-bit image, >127 moves
+    moving_files: dict[float, str] = field(default_factory=dict)  # the frame's timestamp_s -> 8-bit image, >127 moves
     focal_px: float | None = None  # at full width
 
 
@@ -49,26 +49,65 @@ class Source(Protocol):
     size: tuple[int, int]  # (width, height) of the first frame, upright
     length: int | None  # number of frames that frames() will give, None where unknown
     notes: list[str]  # choices and warnings, for the log and run.json
+    has_depth: bool  # frames() can carry depth_m
+    has_semantic: bool  # frames() can carry semantic
 
     def frames(self) -> Iterator[Frame]: ...
     def truth(self) -> Truth | None: ...
 
 
 @dataclass(frozen=True)
-class Pointmap:
-    """One 3-D point a pixel. The holder's field name says whose camera frame the points are in."""
+class WorkFrame:
+    """A frame at working size, with what can be said of it alone."""
 
-    points: Array  # (h, w, 3) float32
-    confidence: Array  # (h, w) float32, 0 = unknown; comparable within one pointmap
+    index: int
+    timestamp_s: float
+    gray: Array  # (h, w) uint8
+    px: Array  # (p, 2) float64 the chosen pixel of every cell, row by row
+    grid: tuple[int, int]  # (rows, cols) of cells, p = rows * cols
+    texture: Array  # (p,) float64 0..1, how well the pixel can be matched
+    semantic: Array | None  # (h, w) float32 P(movable)
+    own_inv_depth: Array | None  # (h, w) float32 measured in this frame alone, 0 = none; None: no such measurement
+
+
+@dataclass(frozen=True)
+class Pointmap:
+    """3-D points of a view's pixels. The holder's field name says whose camera frame the points are in."""
+
+    px: Array  # (p, 2) pixels at working size
+    points: Array  # (p, 3) float64
+    confidence: Array  # (p,) float64 0..1, 0 = unknown
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Pixel pairs of two views, at the provider's working resolution."""
+    """Pixel pairs of two views at working size; row n belongs to ``ref.px[n]``."""
 
-    ref_px: Array  # (n, 2) float64
-    new_px: Array  # (n, 2) float64
-    weight: Array  # (n,) float64 in 0..1; 0 = no match
+    ref_px: Array  # (p, 2) float64
+    new_px: Array  # (p, 2) float64
+    weight: Array  # (p,) float64 in 0..1; 0 = no match
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What is known of a pair before it is looked at."""
+
+    camera: Camera  # at working size
+    ref_inv_depth: Array | None = None  # (p,) at ref.px
+    ref_depth_info: Array | None = None  # (p,) 1/variance of it, unit pixel noise
+    new_from_ref: Array | None = None  # (4, 4)
+    flow: Array | None = None  # (h, w, 2) float32 ref -> new
+
+
+@dataclass(frozen=True)
+class PairPrediction:
+    """Two views seen together: both pointmaps in ref's camera, and the matches between them."""
+
+    matches: Matches
+    ref: Pointmap  # in ref's camera, at matches.ref_px
+    new: Pointmap  # in ref's camera, at matches.new_px
+    new_own: Pointmap | None  # new's points in NEW's camera, where the provider measures depth in a frame alone
+    flow: Array  # (h, w, 2) float32 ref -> new
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,88 @@
+"""Re-mapping residuals of a pair under a pose, and the pose that makes them small."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.gauss_newton import damped_solve
+from ..geometry.reprojection import MIN_DEPTH, edge_residuals, pose_system
+from ..geometry.se3 import se3_exp
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class StaticMatches:
+    """Matches of a pair with the weight of eq. (5)(6): P(static) of both ends times the match's own weight."""
+
+    px: Array  # (p, 2) in ref
+    inv_depth: Array  # (p,) in ref
+    depth_info: Array  # (p,) 1/variance of it, unit pixel noise
+    target: Array  # (p, 2) in new
+    weight: Array  # (p,)
+    lens: Array  # (4,) log f, k, cx, cy
+
+    @property
+    def count(self) -> int:
+        """Matches that say something."""
+        return int((self.weight > 0.05).sum())
+
+    def residual_px(self, new_from_ref: Array) -> Array:
+        """(p,) norm of the re-mapping residual; 1e3 behind the camera."""
+        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.lens)
+        return np.where(z < MIN_DEPTH, 1e3, np.hypot(r[:, 0], r[:, 1]))
+
+    def quality(self, new_from_ref: Array) -> tuple[float, float]:
+        """(inlier ratio, median residual in px) over the weighted matches.
+
+        A depth that is not known yet is free: only the residual across the epipolar line counts then.
+        """
+        used = self.weight > 0.05
+        if not used.any():
+            return 0.0, float("inf")
+        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.lens)
+        r_far, _ = edge_residuals(self.px, self.inv_depth * 1.02 + 1e-4, self.target, new_from_ref, self.lens)
+        along = (r_far - r) / (0.02 * self.inv_depth + 1e-4)[:, None]
+        share = 1.0 / (self.depth_info + (along**2).sum(1) + 1e-12)
+        squared = (r**2).sum(1) - (r * along).sum(1) ** 2 * share
+        error = np.where(z < MIN_DEPTH, 1e3, np.sqrt(np.maximum(squared, 0.0)))[used]
+        return float((error < 2.0).mean()), float(np.median(error))
+
+
+@dataclass(frozen=True)
+class PoseReport:
+    """A pose from re-mapping residuals."""
+
+    new_from_ref: Array  # (4, 4)
+    information: Array  # (6, 6)
+    iterations: int
+    converged: bool
+
+
+def solve_pose(
+    matches: StaticMatches, new_from_ref: Array, *, kernel_px: float, iterations: int = 20
+) -> PoseReport:
+    """Levenberg-Marquardt on SE(3); each depth is marginalised under its own information, so that a point
+    without depth still fixes rotation and the direction across its epipolar line."""
+    args = (matches.px, matches.inv_depth, matches.depth_info, matches.target, matches.weight)
+    pose, damping, converged, done = new_from_ref, 1e-4, False, 0
+    hess, rhs, cost = pose_system(*args, pose, matches.lens, kernel_px)
+    for done in range(1, iterations + 1):
+        step = damped_solve(hess, rhs, damping)
+        if step is None or damping > 1e4:
+            break
+        trial_pose = se3_exp(step) @ pose
+        trial = pose_system(*args, trial_pose, matches.lens, kernel_px)
+        if trial[2] > cost * (1 + 1e-9):
+            damping *= 10
+            continue
+        damping = max(damping * 0.2, 1e-8)
+        converged = cost - trial[2] < 1e-5 * max(cost, 1e-12)
+        pose, (hess, rhs, cost) = trial_pose, trial
+        if converged:
+            break
+    return PoseReport(pose, hess, done, converged)

@@ -1,0 +1,30 @@
+"""What an alignment gives back: the transform and how far to trust it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Pose of a new view against its reference."""
+
+    new_from_ref: Array  # (4, 4) rigid
+    scale: float  # factor that brings new's own points to ref's scale; 1 where new has no own points
+    converged: bool
+    iterations: int
+    inlier_ratio: float  # share of the weighted matches within 2 px (3 sigma for own points)
+    error_px: float  # median re-mapping residual of the weighted matches, inf without any
+    information: Array  # (6, 6) of a left perturbation of new_from_ref, unit pixel noise
+    stages: tuple[str, ...]  # what ran, in order
+
+    @staticmethod
+    def failed(new_from_ref: Array, stage: str) -> Alignment:
+        """Nothing could be solved; the pose is the guess."""
+        return Alignment(new_from_ref, 1.0, False, 0, 0.0, float("inf"), np.zeros((6, 6)), (stage,))

@@ -1,0 +1,36 @@
+"""What goes into the dynamic mask and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+from ..geometry.camera import Camera
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class DynamicsInput:
+    """One frame with its pose and with what the map expects to be seen from there."""
+
+    index: int
+    timestamp_s: float
+    gray: Array  # (h, w) uint8
+    camera: Camera  # at (h, w)
+    world_from_cam: Array  # (4, 4)
+    inv_depth: Array  # (h, w) float32, 1 / map unit, of the static background
+    inv_depth_sigma: Array  # (h, w) float32, 1 sigma; inf = unknown
+    own_inv_depth: Array | None = None  # (h, w) float32 measured in this frame, 0 = none
+    semantic: Array | None = None  # (h, w) float32 P(movable)
+
+
+@dataclass(frozen=True)
+class DynamicMask:
+    """P(moving) of every pixel, the decision, and the terms that led to it."""
+
+    probability: Array  # (h, w) float32
+    moving: Array  # (h, w) bool
+    evidence: dict[str, Array]  # name -> (h', w') float32 log-likelihood ratio, for display

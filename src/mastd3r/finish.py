@@ -1,0 +1,158 @@
+"""After the last frame: the joint optimisation over everything, then every frame's pose and the static cloud."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .alignment.reproject import StaticMatches, solve_pose
+from .config import Config
+from .errors import InputError
+from .geometry.se3 import interpolate, inverse
+from .graph.bootstrap import bootstrap
+from .graph.depth import filled, trust
+from .graph.keyframe_graph import FrameRecord, KeyframeGraph
+from .types import State, StaticCloud, Trajectory
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FinalFrame:
+    """One frame at the end of a run."""
+
+    record: FrameRecord
+    world_from_cam: Array  # (4, 4); NaN where there is none
+    state: State
+
+
+def finish_graph(graph: KeyframeGraph, config: Config) -> None:
+    """Start what never started, then optimise everything. Raises InputError for a camera that never moves."""
+    if not graph.initialised:
+        if len(graph.keyframes) < 2 or not bootstrap(graph):
+            raise InputError(
+                f"the camera never moves enough: expected image motion of at least "
+                f"{config.tracking.keyframe_motion_ratio:.0%} of the width with parallax, got "
+                f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
+            )
+    graph.solve_all(config.graph.final_iterations // 2, 1.0)
+    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
+             len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
+
+
+def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
+    """Every frame's pose from its kept matches and the final depths; lost ones between tracked ones interpolated."""
+    out: list[FinalFrame] = []
+    guess, kf_before = np.eye(4), -1
+    for record in graph.records:
+        guess = guess if record.kf_id == kf_before else np.eye(4)
+        kf_before = record.kf_id
+        if record.state == "lost":
+            out.append(FinalFrame(record, np.full((4, 4), np.nan), "lost"))
+            continue
+        guess = np.eye(4) if record.is_keyframe else _refined(graph, record, guess)
+        record.cam_from_kf = guess
+        cam_from_world = guess @ graph.blocks[record.kf_id].cam_from_world
+        out.append(FinalFrame(record, inverse(cam_from_world), record.state))
+    return _bridged(out)
+
+
+def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
+    block, keep = graph.blocks[record.kf_id], record.points
+    if len(keep) < 20:
+        return guess
+    matches = StaticMatches(
+        block.px[keep],
+        block.inv_depth[keep],
+        graph.depth_info(record.kf_id)[keep],
+        record.target.astype(float),
+        record.weight.astype(float),
+        graph.lens.g,
+    )
+    near = solve_pose(matches, guess, kernel_px=3.0).new_from_ref
+    return solve_pose(matches, near, kernel_px=1.0).new_from_ref
+
+
+def _bridged(frames: list[FinalFrame]) -> list[FinalFrame]:
+    """Poses for lost frames: between two tracked ones by interpolation, at the ends by standing still."""
+    good = [n for n, f in enumerate(frames) if f.state != "lost"]
+    if not good:
+        return frames
+    out = list(frames)
+    for n, f in enumerate(frames):
+        if f.state != "lost":
+            continue
+        before = max((g for g in good if g < n), default=None)
+        after = min((g for g in good if g > n), default=None)
+        if before is None or after is None:
+            nearest = before if before is not None else after
+            assert nearest is not None
+            pose = frames[nearest].world_from_cam
+        else:
+            a, b = frames[before], frames[after]
+            span = b.record.timestamp_s - a.record.timestamp_s
+            ratio = (f.record.timestamp_s - a.record.timestamp_s) / span if span > 0 else 0.5
+            pose = interpolate(a.world_from_cam, b.world_from_cam, ratio)
+        out[n] = FinalFrame(f.record, pose, "interpolated")
+    return out
+
+
+def trajectory_of(frames: list[FinalFrame]) -> Trajectory:
+    """All frames as a trajectory."""
+    return Trajectory(
+        np.array([f.record.timestamp_s for f in frames]),
+        np.stack([f.world_from_cam for f in frames]) if frames else np.zeros((0, 4, 4)),
+        tuple(f.state for f in frames),
+        np.array([f.record.is_keyframe for f in frames], bool),
+    )
+
+
+def static_cloud(graph: KeyframeGraph, colors: dict[int, Array], moving: dict[int, Array]) -> StaticCloud:
+    """Fused static points of the keyframes in ``colors``: (p, 3) uint8 at each keyframe's px; ``moving`` (p,).
+
+    Moving points and points without support are pruned. A pixel whose own depth is unsure stands at its
+    neighbours' depth, with the confidence halved.
+    """
+    camera = graph.camera()
+    parts = []
+    for k, color in colors.items():
+        block, kf = graph.blocks[k], graph.keyframes[k]
+        info = graph.depth_info(k)
+        own = trust(block.inv_depth, info)
+        inv_depth = filled(block.inv_depth, info, kf.work.grid)
+        support = filled(np.maximum(own, 1e-3), np.full(len(own), 1e12), kf.work.grid)
+        confidence = np.where(own > 0.5, own, 0.5 * support) * (1 - moving[k])
+        keep = (confidence > 0.05) & (moving[k] < 0.5) & (inv_depth > 0.02 * np.median(inv_depth))
+        depth = 1 / np.maximum(inv_depth, 1e-9)
+        points_cam = camera.rays(block.px) * depth[:, None]
+        pose = graph.world_from_cam(k)
+        cell = graph.size[0] / kf.work.grid[1]
+        parts.append(
+            (
+                (points_cam @ pose[:3, :3].T + pose[:3, 3])[keep],
+                color[keep],
+                confidence[keep],
+                (depth * cell / camera.fx_px)[keep],
+                np.full(int(keep.sum()), k),
+            )
+        )
+    if not parts:
+        return StaticCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), *_no_points())
+    points, color, confidence, spacing, kf_id = (np.concatenate(c) for c in zip(*parts, strict=True))
+    return StaticCloud(
+        points.astype(np.float32),
+        color.astype(np.uint8),
+        confidence.astype(np.float32),
+        spacing.astype(np.float32),
+        kf_id.astype(np.int32),
+    )
+
+
+def _no_points() -> tuple[Array, Array, Array]:
+    return np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)

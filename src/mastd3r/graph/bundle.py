@@ -1,0 +1,241 @@
+"""Joint optimisation of keyframe poses, inverse depths and intrinsics from flow matches (docs/joint_optimisation.md).
+
+Levenberg-Marquardt; depths are eliminated by the Schur complement, host by host, so the dense system that is solved
+has 6 rows a keyframe and 4 for the lens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.gauss_newton import damped_solve
+from ..geometry.reprojection import N_COLS, N_GLOBAL, host_cost, host_system
+from ..geometry.se3 import adjoint, inverse, se3_exp
+
+Array = NDArray[Any]
+
+
+@dataclass
+class Edge:
+    """Matches of host i's grid pixels in keyframe j."""
+
+    i: int
+    j: int
+    target: Array  # (p, 2) float64 pixels in j
+    weight: Array  # (p,) float64, 0 = no match
+
+
+@dataclass
+class Lens:
+    """Shared intrinsics g = (log f, k, cx, cy) at the working resolution, with a Gaussian prior on each."""
+
+    g: Array  # (4,)
+    prior: Array  # (4,)
+    prior_info: Array  # (4,) 1/variance in px^-2 units; inf = fixed
+
+    @property
+    def free(self) -> Array:
+        """(4,) bool, which intrinsics are estimated."""
+        return np.isfinite(self.prior_info)
+
+
+@dataclass
+class Block:
+    """One keyframe in the problem."""
+
+    px: Array  # (p, 2)
+    inv_depth: Array  # (p,)
+    prior_depth: Array  # (p,)
+    prior_info: Array  # (p,) information of prior_depth
+    cam_from_world: Array  # (4, 4)
+    depth_info: Array = field(default_factory=lambda: np.zeros(0))  # (p,) H_dd of the last solve
+
+
+@dataclass(frozen=True)
+class SolveReport:
+    """How a joint optimisation ended."""
+
+    iterations: int
+    converged: bool
+    cost_first: float
+    cost_last: float
+    focal_sigma_ratio: float  # 1-sigma of log f under unit pixel noise, inf where f is fixed
+
+
+@dataclass
+class _Host:
+    """What one host contributes in one iteration, kept for the back-substitution."""
+
+    columns: Array  # global column of each local column, -1 = fixed
+    cross: Array  # (p, n) E
+    hdd: Array
+    bd: Array
+
+
+def solve(
+    blocks: dict[int, Block],
+    edges: Sequence[Edge],
+    lens: Lens,
+    *,
+    fixed: frozenset[int],
+    iterations: int,
+    kernel_px: float = 1.0,
+    tolerance: float = 1e-4,
+) -> SolveReport:
+    """Optimise in place. Poses in ``fixed`` stay; every host's depths and the free intrinsics move.
+
+    Stops when the relative decrease of the robust cost is below ``tolerance``. A singular system or an
+    exhausted damping ends the loop with ``converged=False``.
+    """
+    by_host: dict[int, list[Edge]] = {}
+    for edge in edges:
+        by_host.setdefault(edge.i, []).append(edge)
+    moving = [k for k in blocks if k not in fixed]
+    row_of = {k: 6 * n for n, k in enumerate(moving)}
+    damping, cost_first, cost, done, converged = 1e-4, -1.0, -1.0, 0, False
+    sigma = float("inf")
+    for done in range(1, iterations + 1):
+        hess, rhs, hosts, cost = _linearise(blocks, by_host, lens, row_of, kernel_px)
+        cost_first = cost if cost_first < 0 else cost_first
+        accepted = False
+        for _ in range(6):
+            step = damped_solve(hess, rhs, damping)
+            if step is None:
+                damping *= 10
+                continue
+            saved = _apply(blocks, lens, hosts, row_of, step)
+            trial = _cost(blocks, by_host, lens, kernel_px)
+            if trial <= cost * (1 + 1e-9):
+                accepted = True
+                break
+            _restore(blocks, lens, saved)
+            damping *= 10
+        if not accepted:
+            break
+        damping = max(damping * 0.2, 1e-7)
+        sigma = _focal_sigma(hess, lens)
+        if cost - trial < tolerance * max(cost, 1e-12):
+            converged, cost = True, trial
+            break
+        cost = trial
+    return SolveReport(done, converged, cost_first, cost, sigma)
+
+
+def _gather(blocks: dict[int, Block], edges: list[Edge]) -> tuple[Array, Array, Array]:
+    host_from_world = blocks[edges[0].i].cam_from_world
+    world_from_host = inverse(host_from_world)
+    j_from_i = np.stack([blocks[e.j].cam_from_world @ world_from_host for e in edges])
+    return np.stack([e.target for e in edges]), np.stack([e.weight for e in edges]), j_from_i
+
+
+def _linearise(
+    blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, row_of: dict[int, int], kernel_px: float
+) -> tuple[Array, Array, dict[int, _Host], float]:
+    size = 6 * len(row_of) + N_GLOBAL
+    hess, rhs = np.zeros((size, size)), np.zeros(size)
+    hosts: dict[int, _Host] = {}
+    total = _prior_cost(blocks, by_host, lens)
+    lens_cols = np.where(lens.free, np.arange(size - N_GLOBAL, size), -1)
+    for i, edges in by_host.items():
+        block = blocks[i]
+        target, weight, j_from_i = _gather(blocks, edges)
+        h, b, e, hdd, bd, cost = host_system(
+            block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px
+        )
+        total += float(cost.sum())
+        block.depth_info = hdd.sum(0)
+        hdd_i = block.depth_info + block.prior_info + 1e-9
+        bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
+        local_h, local_b, cross = _host_local(h, b, e, j_from_i)
+        columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
+        scaled = cross / hdd_i[:, None]
+        local_h -= scaled.T @ cross
+        local_b -= scaled.T @ bd_i
+        keep = columns >= 0
+        rows = columns[keep]
+        np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
+        np.add.at(rhs, rows, local_b[keep])
+        hosts[i] = _Host(columns, cross, hdd_i, bd_i)
+    free = np.flatnonzero(lens.free)
+    rows = size - N_GLOBAL + free
+    hess[rows, rows] += lens.prior_info[free]
+    rhs[rows] += lens.prior_info[free] * (lens.prior[free] - lens.g[free])
+    return hess, rhs, hosts, total
+
+
+def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
+    row = row_of.get(k)
+    return np.full(6, -1) if row is None else np.arange(row, row + 6)
+
+
+def _host_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
+    """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, lens]: J_i = -J_j Ad(j_from_i)."""
+    m = len(h)
+    n = 6 + 6 * m + N_GLOBAL
+    hess, rhs, cross = np.zeros((n, n)), np.zeros(n), np.zeros((e.shape[1], n), np.float64)
+    lens = slice(n - N_GLOBAL, n)
+    for k in range(m):
+        to_local = np.zeros((N_COLS, 6 + N_COLS))
+        to_local[:6, :6] = -adjoint(j_from_i[k])
+        to_local[:, 6:] = np.eye(N_COLS)
+        part = to_local.T @ h[k] @ to_local
+        at = np.r_[0:6, 6 + 6 * k : 12 + 6 * k, n - N_GLOBAL : n]
+        hess[np.ix_(at, at)] += part
+        rhs[at] += to_local.T @ b[k]
+        cross[:, :6] += e[k, :, :6] @ to_local[:6, :6]
+        cross[:, 6 + 6 * k : 12 + 6 * k] = e[k, :, :6]
+        cross[:, lens] += e[k, :, 6:]
+    return hess, rhs, cross
+
+
+def _focal_sigma(hess: Array, lens: Lens) -> float:
+    if not lens.free[0]:
+        return float("inf")
+    unit = np.zeros(len(hess))
+    unit[-N_GLOBAL] = 1.0
+    column = damped_solve(hess, unit, 1e-9)
+    return float("inf") if column is None or column[-N_GLOBAL] <= 0 else float(np.sqrt(column[-N_GLOBAL]))
+
+
+def _apply(
+    blocks: dict[int, Block], lens: Lens, hosts: dict[int, _Host], row_of: dict[int, int], step: Array
+) -> tuple[Array, dict[int, tuple[Array, Array]]]:
+    saved = (lens.g.copy(), {k: (b.cam_from_world, b.inv_depth) for k, b in blocks.items()})
+    for k, row in row_of.items():
+        blocks[k].cam_from_world = se3_exp(step[row : row + 6]) @ blocks[k].cam_from_world
+    lens.g = lens.g + step[-N_GLOBAL:]
+    for i, host in hosts.items():
+        local = np.where(host.columns >= 0, step[host.columns], 0.0)
+        delta = (host.bd - host.cross @ local) / host.hdd
+        depth = blocks[i].inv_depth
+        blocks[i].inv_depth = np.clip(depth + delta, 0.25 * depth, 4.0 * depth + 1e-3)
+    return saved
+
+
+def _restore(blocks: dict[int, Block], lens: Lens, saved: tuple[Array, dict[int, tuple[Array, Array]]]) -> None:
+    lens.g = saved[0]
+    for k, (pose, depth) in saved[1].items():
+        blocks[k].cam_from_world, blocks[k].inv_depth = pose, depth
+
+
+def _prior_cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens) -> float:
+    free = lens.free
+    total = float((lens.prior_info[free] * (lens.g - lens.prior)[free] ** 2).sum())
+    for i in by_host:
+        b = blocks[i]
+        total += float((b.prior_info * (b.inv_depth - b.prior_depth) ** 2).sum())
+    return total
+
+
+def _cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, kernel_px: float) -> float:
+    total = _prior_cost(blocks, by_host, lens)
+    for i, edges in by_host.items():
+        target, weight, j_from_i = _gather(blocks, edges)
+        block = blocks[i]
+        total += float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
+    return total

@@ -1,0 +1,70 @@
+"""Which keyframes may see the same place: by predicted overlap, and by a small picture of each (place recognition)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.se3 import inverse, transform
+from .keyframe_graph import Keyframe, KeyframeGraph
+
+Array = NDArray[Any]
+
+
+def overlap(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[float, float]:
+    """(share of keyframe i's points inside the view, their median image motion / width) under current poses."""
+    block, camera = graph.blocks[i], graph.camera().pinhole
+    px = block.px[::4]
+    rays = camera.rays(px)
+    points = transform(cam_from_world @ inverse(block.cam_from_world), rays / block.inv_depth[::4, None])
+    front = points[:, 2] > 1e-3
+    seen = camera.project(np.where(front[:, None], points, 1.0))
+    inside = front & (seen >= 0).all(1) & (seen[:, 0] < camera.width) & (seen[:, 1] < camera.height)
+    if not inside.any():
+        return 0.0, float("inf")
+    return float(inside.mean()), float(np.median(np.linalg.norm(seen - px, axis=1)[inside]) / camera.width)
+
+
+def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_overlap: float) -> list[int]:
+    """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours."""
+    pose = graph.blocks[kf_id].cam_from_world
+    found = []
+    for k in range(before):
+        share, motion = overlap(graph, k, pose)
+        if share >= min_overlap and motion < 0.5:
+            found.append((motion, k))
+    chosen: list[int] = []
+    for _, k in sorted(found):
+        if len(chosen) == most:
+            break
+        if all(abs(k - c) > 1 for c in chosen):
+            chosen.append(k)
+    return chosen
+
+
+def thumbnail(gray: Array) -> Array:
+    """A place descriptor without weights: 24 x 18 blurred picture, zero mean, unit norm, (432,) float32."""
+    small = cv2.GaussianBlur(cv2.resize(gray, (24, 18), interpolation=cv2.INTER_AREA).astype(np.float32), (0, 0), 1.0)
+    small -= small.mean()
+    return (small / max(float(np.linalg.norm(small)), 1e-6)).reshape(-1)
+
+
+class PlaceIndex:
+    """Place recognition: keyframes whose thumbnails look most alike. Nothing is believed before it is verified."""
+
+    def __init__(self) -> None:
+        self._known: list[Array] = []
+
+    def best(self, graph: KeyframeGraph, gray: Array, skip: int, count: int = 3) -> list[Keyframe]:
+        """Up to ``count`` keyframes that look most like ``gray``, without ``skip``."""
+        del self._known[len(graph.keyframes) :]
+        for kf in graph.keyframes[len(self._known) :]:
+            self._known.append(thumbnail(kf.work.gray))
+        if not self._known:
+            return []
+        likeness = np.stack(self._known) @ thumbnail(gray)
+        order = [int(k) for k in np.argsort(-likeness, kind="stable") if k != skip]
+        return [graph.keyframes[k] for k in order[:count]]

@@ -1,0 +1,149 @@
+"""The Gaussian map: torch parameters, each Gaussian anchored to the keyframe that saw it first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from .rasterise import rasterization
+from .screen import ScreenStats
+
+Array = NDArray[Any]
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "colors")
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """The map for export, in plain numbers."""
+
+    means: Array  # (n, 3) float32, world
+    scales: Array  # (n, 3) float32, standard deviations in map units
+    quats: Array  # (n, 4) float32 wxyz, unit length
+    opacities: Array  # (n,) float32 0..1
+    colors: Array  # (n, 3) float32 RGB, 0..1
+    kf_id: Array  # (n,) int32
+
+
+@dataclass
+class GaussianMap:
+    """Parameters as the optimiser sees them; all rows belong together."""
+
+    means: torch.Tensor  # (n, 3) world
+    log_scales: torch.Tensor  # (n, 3) natural logarithm of the standard deviations
+    quats: torch.Tensor  # (n, 4) wxyz, any length
+    opacity_logits: torch.Tensor  # (n,)
+    colors: torch.Tensor  # (n, 3) RGB, 0..1 but not clamped
+    kf_id: torch.Tensor  # (n,) int32
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The tensors that are optimised, by name."""
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    def picked(self, rows: torch.Tensor) -> GaussianMap:
+        """A copy of some rows, in the order given (repeats allowed), as new leaves."""
+        tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}
+        return GaussianMap(**tensors, kf_id=self.kf_id[rows])
+
+    def draw(
+        self,
+        cam_from_world: torch.Tensor,
+        intrinsics: torch.Tensor,
+        width: int,
+        height: int,
+        near: float,
+        background: torch.Tensor | None = None,
+        stats: ScreenStats | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Colour (h,w,3), alpha-weighted depth sum (h,w) and alpha (h,w) from one camera."""
+        return rasterization(
+            self.means,
+            self.quats,
+            self.log_scales.exp(),
+            self.opacity_logits.sigmoid(),
+            self.colors,
+            cam_from_world,
+            intrinsics,
+            width,
+            height,
+            near=near,
+            background=background,
+            stats=stats,
+        )
+
+    def moved(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> GaussianMap:
+        """The map after a graph correction: every Gaussian keeps its place in its keyframe's camera.
+
+        Keyframes that are missing in either dict do not move. Poses are (4, 4); a scale in their
+        rotation block is honoured.
+        """
+        means, quats, log_scales = (t.detach().clone() for t in (self.means, self.quats, self.log_scales))
+        for kf in sorted(set(old_world_from_kf) & set(new_world_from_kf)):
+            rows = torch.nonzero(self.kf_id == kf)[:, 0]
+            if len(rows) == 0:
+                continue
+            change = np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(
+                np.asarray(old_world_from_kf[kf], float)
+            )
+            scale = float(np.cbrt(np.linalg.det(change[:3, :3])))
+            linear, shift = (torch.from_numpy(c.copy()) for c in (change[:3, :3], change[:3, 3]))
+            means[rows] = (means[rows].double() @ linear.T.to(means.device) + shift.to(means.device)).to(
+                means
+            )
+            turn = torch.from_numpy(quaternion_from_rotation(change[:3, :3] / scale)).to(quats)
+            quats[rows] = quaternion_product(turn, quats[rows])
+            log_scales[rows] += float(np.log(scale))
+        tensors = {"means": means, "quats": quats, "log_scales": log_scales}
+        return replace(self, **{name: t.requires_grad_() for name, t in tensors.items()})
+
+    def arrays(self) -> GaussianArrays:
+        """Plain numpy arrays for export."""
+        with torch.no_grad():
+            quats = self.quats / self.quats.norm(dim=1, keepdim=True)
+            return GaussianArrays(
+                means=_numpy(self.means),
+                scales=_numpy(self.log_scales.exp()),
+                quats=_numpy(quats),
+                opacities=_numpy(self.opacity_logits.sigmoid()),
+                colors=_numpy(self.colors.clamp(0, 1)),
+                kf_id=self.kf_id.cpu().numpy(),
+            )
+
+
+def _numpy(tensor: torch.Tensor) -> Array:
+    return tensor.float().cpu().numpy().copy()
+
+
+def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Hamilton product, wxyz; shapes broadcast."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    parts = [
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    ]
+    return torch.stack(parts, -1)
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """(3, 3) rotation to (4,) wxyz: eigenvector of Bar-Itzhack's symmetric matrix, stable at every angle."""
+    m = np.asarray(rotation, float)
+    k = np.array(
+        [
+            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
+            [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
+            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
+            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
+        ]
+    )
+    _, vectors = np.linalg.eigh(k, UPLO="U")
+    quaternion = vectors[:, -1]
+    return quaternion if quaternion[0] >= 0 else -quaternion

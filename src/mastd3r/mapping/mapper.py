@@ -1,0 +1,217 @@
+"""Algorithm 1: the Gaussian map, trained view by view under the static weights (III-C)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..config import MappingConfig
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..types import StaticCloud, View
+from .adam import RowAdam
+from .densify import DensifyPolicy, DensifySettings
+from .gaussians import Array, GaussianArrays, GaussianMap
+from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
+from .screen import ScreenStats
+from .seed import seed_gaussians
+from .threads import one_torch_thread
+from .view_parameters import ViewParameters
+
+
+@dataclass(frozen=True)
+class TrainingRates:
+    """Adam steps; the means' is a share of the median depth of the seeds and falls to a hundredth."""
+
+    means: float = 3.2e-4
+    means_last_ratio: float = 0.01
+    log_scales: float = 5e-3
+    quats: float = 1e-3
+    opacity_logits: float = 5e-2
+    colors: float = 2.5e-3
+
+
+SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
+
+
+class Mapper:
+    """Owns the map and its optimiser. Same seed, same views, same result on one machine."""
+
+    def __init__(
+        self,
+        config: MappingConfig,
+        cloud: StaticCloud,
+        views: list[View],
+        seed: int,
+        device: str = "cpu",
+        rates: TrainingRates | None = None,
+        densify: DensifySettings | None = None,
+    ) -> None:
+        """Seed the map from ``cloud``; ``views`` beyond ``config.max_views`` are thinned evenly.
+
+        Raises InputError for no view, views of the wrong shape, or a cloud without a usable point.
+        """
+        self._views = _evenly(_checked_views(views), config.max_views)
+        self.config, self._rates, self._device = config, rates or TrainingRates(), device
+        self._map = seed_gaussians(cloud, max(1, int(config.max_gaussians * SEED_SHARE)), seed, device)
+        self._adam = RowAdam(self._map.parameters())
+        self._policy = DensifyPolicy(
+            config.max_gaussians, config.iterations, seed, densify or DensifySettings()
+        )
+        self._depth, self._near = _depths(self._map, self._views)
+        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, device)
+        self._background = _mean_color(self._views).to(device)
+        self._order = _view_order(len(self._views), seed)
+        self._step = 0
+
+    @property
+    def gaussians(self) -> GaussianArrays:
+        """The map as plain arrays."""
+        return self._map.arrays()
+
+    def refine(self, steps: int, on_step: Callable[[int, float], None] | None = None) -> None:
+        """Run ``steps`` optimisation steps, one view each; ``on_step(step, loss)`` counts from 1.
+
+        The schedule of rates and densification is that of ``config.iterations`` steps in all.
+        """
+        with one_torch_thread():
+            for _ in range(steps):
+                self._step += 1
+                loss = self._one_step(next(self._order))
+                if on_step is not None:
+                    on_step(self._step, loss)
+
+    def render(
+        self, world_from_cam: Array, camera: Camera, timestamp_s: float | None = None
+    ) -> tuple[Array, Array, Array]:
+        """Colour (h,w,3) float32 0..1, depth (h,w) in map units (0 where nothing is), alpha (h,w).
+
+        With ``timestamp_s`` the exposure (and the pose correction, where poses are refined) is interpolated
+        between the training views around it, else the exposure is neutral and the pose as given.
+        """
+        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float))).to(self._device)
+        K = torch.from_numpy(camera.matrix).to(self._device)
+        with torch.no_grad():
+            if timestamp_s is not None:
+                cam_from_world = self._view_parameters.corrected_at(cam_from_world, timestamp_s)
+            color, depth, alpha = self._draw(cam_from_world, K, camera.width, camera.height, None)
+            if timestamp_s is not None:
+                color = self._view_parameters.exposed_at(color, timestamp_s)
+            depth = torch.where(alpha > 0.5, depth / alpha.clamp_min(1e-6), torch.zeros_like(depth))
+        return color.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), alpha.cpu().numpy()
+
+    def move_keyframes(
+        self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]
+    ) -> None:
+        """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""
+        self._map = self._map.moved(old_world_from_kf, new_world_from_kf)
+        self._view_parameters.move_keyframes(old_world_from_kf, new_world_from_kf)
+
+    def _draw(
+        self,
+        cam_from_world: torch.Tensor,
+        K: torch.Tensor,
+        width: int,
+        height: int,
+        stats: ScreenStats | None,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        return self._map.draw(cam_from_world, K, width, height, self._near, self._background, stats)
+
+    def _one_step(self, number: int) -> float:
+        view, camera, stats = self._views[number], self._views[number].camera, ScreenStats()
+        K = torch.from_numpy(camera.matrix).to(self._device)
+        cam_from_world = self._view_parameters.cam_from_world(number)
+        color, _, _ = self._draw(cam_from_world, K, camera.width, camera.height, stats)
+        color = self._view_parameters.exposed(color, number)
+        loss = self._loss(color, view) + self._view_parameters.prior(number)
+        loss.backward()
+        self._policy.observe(self._map, stats, camera.width)
+        self._adam.step(self._map.parameters(), self._current_rates())
+        self._view_parameters.step(number, self._done_ratio)
+        if self._policy.due(self._step):
+            self._map = self._policy.round(self._map, self._adam, camera.width)
+        return float(loss.detach())
+
+    def _loss(self, color: torch.Tensor, view: View) -> torch.Tensor:
+        c = self.config
+        target, static = (
+            torch.from_numpy(np.ascontiguousarray(a)).to(color) for a in (view.image, view.static)
+        )
+        u = None if view.uncertainty is None else torch.from_numpy(view.uncertainty).to(color)
+        paper = c.paper_loss
+        weight = pixel_weight(c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, paper)
+        if paper:
+            return mask_loss(squared_color_error(color, target), weight)
+        return photometric_loss(color, target, weight)
+
+    @property
+    def _done_ratio(self) -> float:
+        return min(1.0, self._step / max(1, self.config.iterations))
+
+    def _current_rates(self) -> dict[str, float]:
+        r = self._rates
+        return {
+            "means": r.means * self._depth * r.means_last_ratio**self._done_ratio,
+            "log_scales": r.log_scales,
+            "quats": r.quats,
+            "opacity_logits": r.opacity_logits,
+            "colors": r.colors,
+        }
+
+
+def _checked_views(views: list[View]) -> list[View]:
+    if not views:
+        raise InputError("Gaussian map: expected at least one training view, got none")
+    for view in views:
+        size = (view.camera.height, view.camera.width)
+        if view.image.shape != (*size, 3) or view.static.shape != size:
+            raise InputError(
+                f"Gaussian map, view at {view.timestamp_s} s: expected image {(*size, 3)} and static {size}, "
+                f"got {view.image.shape} and {view.static.shape}"
+            )
+    return views
+
+
+def _evenly(views: list[View], limit: int) -> list[View]:
+    if len(views) <= limit:
+        return views
+    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, limit).round().astype(int))]
+
+
+def _depths(gaussians: GaussianMap, views: list[View]) -> tuple[float, float]:
+    """Median depth of the seeds that a few cameras see, and the near limit below which nothing is drawn.
+
+    The limit is half of the nearest percent, kept within 2 % to 25 % of the median: floaters love the space
+    right before the lens, where hardly another view contradicts them.
+    """
+    means = gaussians.means.detach().double().cpu().numpy()
+    depths = []
+    for view in views[:: max(1, len(views) // 8)]:
+        points_cam = (means - view.world_from_cam[:3, 3]) @ view.world_from_cam[:3, :3]
+        points_cam = points_cam[points_cam[:, 2] > 1e-9]
+        camera, pixels = view.camera, view.camera.project(points_cam)
+        inside = ((pixels > -0.5) & (pixels < [camera.width - 0.5, camera.height - 0.5])).all(1)
+        depths.append(points_cam[inside, 2])
+    every = np.concatenate(depths)
+    if len(every) == 0:
+        raise InputError("Gaussian map: expected static points in front of the cameras, got none")
+    median = float(np.median(every))
+    return median, float(np.clip(0.5 * np.percentile(every, 1), 0.02 * median, 0.25 * median))
+
+
+def _mean_color(views: list[View]) -> torch.Tensor:
+    """What lies behind everything: the mean colour of the photographs' static pixels."""
+    few = views[:: max(1, len(views) // 16)]
+    total = sum(float(v.static.sum()) for v in few)
+    mean = sum((v.image * v.static[..., None]).sum((0, 1), dtype=np.float64) for v in few) / max(total, 1e-9)
+    return torch.from_numpy(np.asarray(mean, np.float32))
+
+
+def _view_order(count: int, seed: int) -> Iterator[int]:
+    """Every view once, in a new random order each time."""
+    rng = np.random.default_rng(seed)
+    while True:
+        yield from (int(i) for i in rng.permutation(count))

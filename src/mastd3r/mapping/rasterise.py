@@ -1,0 +1,78 @@
+"""The one rasteriser signature; the device of ``means`` chooses the backend (CPU: numba, CUDA: gsplat)."""
+
+from __future__ import annotations
+
+import torch
+
+from ..errors import InputError
+from .screen import ScreenStats
+
+
+def rasterization(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    background: torch.Tensor | None = None,
+    stats: ScreenStats | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Draw 3-D Gaussians; differentiable in the Gaussians and the view matrix.
+
+    means (N,3) world; quats (N,4) wxyz, any length; scales (N,3) standard deviations; opacities (N,) 0..1;
+    colors (N,3); viewmats (4,4) cam_from_world; Ks (3,3) for pixels whose integers are their centres;
+    near: Gaussians whose centre is nearer are not drawn; eps2d: px² added to the 2-D variances;
+    background (3,) colour behind everything, None = black. ``stats`` receives what densification needs.
+
+    Returns color (H,W,3), depth (H,W) = sum of weight · z, NOT divided by alpha, alpha (H,W) = sum of weight.
+    Raises InputError for wrong shapes or an unknown device, MissingPackage for CUDA without gsplat.
+    """
+    _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height)
+    arguments = (means, quats, scales, opacities, colors, viewmats, Ks, width, height, near, eps2d, stats)
+    if means.device.type == "cpu":
+        from .rasterise_cpu import rasterise_cpu
+
+        color, depth, alpha = rasterise_cpu(*arguments)
+    elif means.device.type == "cuda":
+        from .rasterise_gsplat import rasterise_gsplat
+
+        color, depth, alpha = rasterise_gsplat(*arguments)
+    else:
+        raise InputError(f"rasterization: expected tensors on cpu or cuda, got {means.device}")
+    if background is not None:
+        color = color + (1 - alpha)[..., None] * background
+    return color, depth, alpha
+
+
+def _check(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+) -> None:
+    n = len(means)
+    expected = {
+        "means": (means, (n, 3)),
+        "quats": (quats, (n, 4)),
+        "scales": (scales, (n, 3)),
+        "opacities": (opacities, (n,)),
+        "colors": (colors, (n, 3)),
+        "viewmats": (viewmats, (4, 4)),
+        "Ks": (Ks, (3, 3)),
+    }
+    for name, (tensor, shape) in expected.items():
+        if tuple(tensor.shape) != shape:
+            raise InputError(f"rasterization {name}: expected shape {shape}, got {tuple(tensor.shape)}")
+    if width < 1 or height < 1:
+        raise InputError(f"rasterization size: expected at least 1 x 1, got {width} x {height}")

@@ -1,0 +1,97 @@
+"""What the map learns of each training view: exposure (gain and bias a channel) and, on request, its pose."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from ..types import View
+from .adam import RowAdam
+from .gaussians import Array
+
+_EXPOSURE_RATE = 2e-3
+_EXPOSURE_PRIOR = 1e-2  # holds the mean exposure near neutral
+_POSE_RATE = 1e-3  # radians, and map units per unit of median depth
+_POSE_RATE_LAST_RATIO = 0.1
+_NAMES = ("log_gain", "bias", "shift", "turn")
+
+
+class ViewParameters:
+    """Exposure and pose corrections of all training views, one row a view.
+
+    A pose correction acts on the left of cam_from_world: shift in units of ``depth``, turn a rotation vector.
+    """
+
+    def __init__(self, views: list[View], refine_poses: bool, depth: float, device: str) -> None:
+        self._timestamps_s = np.array([v.timestamp_s for v in views])
+        self._kf_id = [v.kf_id for v in views]
+        self._world_from_cam = [np.asarray(v.world_from_cam, float) for v in views]
+        self._cam_from_world = [torch.from_numpy(np.linalg.inv(p)).to(device) for p in self._world_from_cam]
+        self._rows = [
+            {name: torch.zeros(3, device=device, requires_grad=True) for name in _NAMES} for _ in views
+        ]
+        self._adams = [RowAdam(row) for row in self._rows]
+        self._refine_poses, self._depth = refine_poses, depth
+
+    def cam_from_world(self, number: int) -> torch.Tensor:
+        """(4, 4) float64 of one training view, with its correction."""
+        start, row = self._cam_from_world[number], self._rows[number]
+        return self._motion(row["shift"], row["turn"]) @ start if self._refine_poses else start
+
+    def exposed(self, color: torch.Tensor, number: int) -> torch.Tensor:
+        """Colour as that view's exposure shows it: gain * colour + bias."""
+        return color * self._rows[number]["log_gain"].exp() + self._rows[number]["bias"]
+
+    def exposed_at(self, color: torch.Tensor, timestamp_s: float) -> torch.Tensor:
+        """Colour under an exposure interpolated linearly in time between training views."""
+        gain, bias = (self._at(name, timestamp_s).to(color) for name in ("log_gain", "bias"))
+        return color * gain.exp() + bias
+
+    def corrected_at(self, cam_from_world: torch.Tensor, timestamp_s: float) -> torch.Tensor:
+        """A tracked pose under the correction interpolated linearly in time between training views."""
+        if not self._refine_poses:
+            return cam_from_world
+        motion = self._motion(self._at("shift", timestamp_s), self._at("turn", timestamp_s))
+        return motion.to(cam_from_world) @ cam_from_world
+
+    def _at(self, name: str, timestamp_s: float) -> torch.Tensor:
+        order = np.argsort(self._timestamps_s, kind="stable")
+        rows = np.stack([self._rows[i][name].detach().cpu().numpy() for i in order])
+        at = [np.interp(timestamp_s, self._timestamps_s[order], rows[:, k]) for k in range(3)]
+        return torch.tensor(at, dtype=torch.float32)
+
+    def prior(self, number: int) -> torch.Tensor:
+        """A weak pull to neutral exposure."""
+        row = self._rows[number]
+        return _EXPOSURE_PRIOR * (row["log_gain"].square().mean() + row["bias"].square().mean())
+
+    def step(self, number: int, done_ratio: float) -> None:
+        """One Adam step of the view that was just drawn."""
+        pose_rate = _POSE_RATE * _POSE_RATE_LAST_RATIO**done_ratio
+        rates = {"log_gain": _EXPOSURE_RATE, "bias": _EXPOSURE_RATE, "shift": pose_rate, "turn": pose_rate}
+        self._adams[number].step(self._rows[number], rates)
+
+    def move_keyframes(
+        self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]
+    ) -> None:
+        """Views follow their keyframes; a scale in the correction moves their centres only."""
+        for i, kf in enumerate(self._kf_id):
+            if kf not in old_world_from_kf or kf not in new_world_from_kf:
+                continue
+            change = new_world_from_kf[kf] @ np.linalg.inv(old_world_from_kf[kf])
+            pose = change @ self._world_from_cam[i]
+            pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
+            self._world_from_cam[i] = pose
+            self._cam_from_world[i] = torch.from_numpy(np.linalg.inv(pose)).to(self._cam_from_world[i])
+
+    def _motion(self, shift: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
+        """(4, 4) float64: the exponential of SE(3)."""
+        (x, y, z), move = turn.double(), shift.double() * self._depth
+        zero = torch.zeros_like(x)
+        rows = [
+            torch.stack([zero, -z, y, move[0]]),
+            torch.stack([z, zero, -x, move[1]]),
+            torch.stack([-y, x, zero, move[2]]),
+            torch.stack([zero, zero, zero, zero]),
+        ]
+        return torch.linalg.matrix_exp(torch.stack(rows))

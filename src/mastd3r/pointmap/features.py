@@ -1,0 +1,40 @@
+"""Sparse features for jumps that flow cannot follow: a homography as the start of the flow."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+class FeatureStart:
+    """ORB features, mutual matches, RANSAC homography; answers with a dense start for the flow."""
+
+    def __init__(self, features: int = 1500, min_inliers: int = 18) -> None:
+        self._orb = cv2.ORB_create(nfeatures=features, fastThreshold=8)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        self.min_inliers = min_inliers
+
+    def flow(self, ref: Array, new: Array) -> Array | None:
+        """(h, w, 2) float32 flow of the homography ref -> new; None where too few features agree."""
+        points_ref, described_ref = self._orb.detectAndCompute(ref, None)
+        points_new, described_new = self._orb.detectAndCompute(new, None)
+        if described_ref is None or described_new is None:
+            return None
+        matches = self._matcher.match(described_ref, described_new)
+        if len(matches) < self.min_inliers:
+            return None
+        a = np.array([points_ref[m.queryIdx].pt for m in matches], np.float32)
+        b = np.array([points_new[m.trainIdx].pt for m in matches], np.float32)
+        homography, inlier = cv2.findHomography(a, b, cv2.RANSAC, 6.0)
+        if homography is None or inlier is None or int(inlier.sum()) < self.min_inliers:
+            return None
+        h, w = ref.shape
+        x, y = np.meshgrid(np.arange(w, dtype=np.float32), np.arange(h, dtype=np.float32))
+        grid = np.stack([x, y], -1)
+        moved = cv2.perspectiveTransform(grid.reshape(-1, 1, 2), homography).reshape(h, w, 2)
+        return np.clip(moved - grid, -2.0 * w, 2.0 * w).astype(np.float32)

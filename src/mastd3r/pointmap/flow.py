@@ -1,0 +1,91 @@
+"""Dense optical flow with a start, and sub-pixel refinement of chosen pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class FlowResult:
+    """Flow at the chosen pixels, and the dense field it came from."""
+
+    target: Array  # (p, 2) float64 pixels in the new image
+    weight: Array  # (p,) float64 in 0..1 from the forward-backward error; 0 = no match
+    dense: Array  # (h, w, 2) float32 ref -> new
+
+
+class FlowMatcher:
+    """DIS flow from a predicted field, then Lucas-Kanade both ways at the chosen pixels."""
+
+    def __init__(self, width: int, height: int, window_px: int = 13, tolerance_px: float = 1.0) -> None:
+        self.width, self.height = width, height
+        self.tolerance_px = tolerance_px
+        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        self._grid = np.stack([x, y], -1)
+        self._lk: dict[str, Any] = {
+            "winSize": (window_px, window_px),
+            "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.01),
+        }
+
+    def dense(self, ref: Array, new: Array, start: Array | None = None) -> Array:
+        """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched."""
+        if start is None:
+            return self._dis.calc(ref, new, None)
+        warped = self.warp(new, start)
+        rest = self._dis.calc(ref, warped, None)
+        moved = cv2.remap(start, self._grid + rest, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return moved + rest
+
+    def warp(self, new: Array, flow: Array) -> Array:
+        """``new`` seen through a flow ref -> new, (h, w)."""
+        return cv2.remap(new, self._grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def match(self, ref: Array, new: Array, px: Array, start: Array | None = None) -> FlowResult:
+        """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward."""
+        flow = self.dense(ref, new, start)
+        target, weight = self.refine(ref, new, px, flow)
+        return FlowResult(target, weight, flow)
+
+    def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
+        """Lucas-Kanade from a dense start, on the image warped by it so that rotation and scale do not hurt."""
+        warped = self.warp(new, flow)
+        at = px.astype(np.float32).reshape(-1, 1, 2)
+        forward, found, _ = cv2.calcOpticalFlowPyrLK(
+            ref, warped, at, at.copy(), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **self._lk
+        )
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+            warped, ref, forward, at.copy(), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **self._lk
+        )
+        error = np.linalg.norm(back - at, axis=-1)[:, 0]
+        moved = np.linalg.norm(forward - at, axis=-1)[:, 0]
+        xy = forward[:, 0]
+        target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
+        inside = (
+            (target[:, 0] > 1) & (target[:, 1] > 1) & (target[:, 0] < self.width - 2) & (target[:, 1] < self.height - 2)
+        )
+        ok = inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < self.tolerance_px) & (moved < 6.0)
+        weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
+        return target.astype(np.float64), weight.astype(np.float64)
+
+
+def corner_grid(gray: Array, cell_px: int) -> tuple[Array, Array]:
+    """The most corner-like pixel of every cell: (p, 2) float64 pixels and (p,) smaller eigenvalue, in grey² a px².
+
+    The last partial row and column of cells is left out, so p depends on the image size only.
+    """
+    strength = cv2.cornerMinEigenVal(gray, 5, ksize=3)
+    h, w = gray.shape[0] // cell_px * cell_px, gray.shape[1] // cell_px * cell_px
+    rows, cols = h // cell_px, w // cell_px
+    cells = strength[:h, :w].reshape(rows, cell_px, cols, cell_px).transpose(0, 2, 1, 3).reshape(rows * cols, -1)
+    best = cells.argmax(1)
+    cy, cx = np.divmod(np.arange(rows * cols), cols)
+    px = np.stack([cx * cell_px + best % cell_px, cy * cell_px + best // cell_px], 1).astype(float)
+    return px, cells[np.arange(len(best)), best]

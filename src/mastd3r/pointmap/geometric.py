@@ -1,0 +1,150 @@
+"""Pointmaps from images alone: dense flow, the lens found by the graph, and triangulation (the embedded default)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.camera import Camera
+from ..geometry.se3 import transform
+from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
+from .flow import FlowMatcher, corner_grid
+
+Array = NDArray[Any]
+
+
+def working_size(width: int, height: int, area_px: int) -> tuple[int, int]:
+    """Size with about ``area_px`` pixels and the same shape; never larger than the image."""
+    scale = min(1.0, float(np.sqrt(area_px / (width * height))))
+    return max(16, round(width * scale)), max(16, round(height * scale))
+
+
+class GeometricPointmaps:
+    """Provider that needs no weights and no depth sensor."""
+
+    name = "geometric"
+    depth_sigma_ratio: float | None = None
+
+    def __init__(self, width: int, height: int, cell_px: int) -> None:
+        self.width, self.height, self.cell_px = width, height, cell_px
+        self.flow = FlowMatcher(width, height)
+
+    def observe(self, frame: Frame) -> WorkFrame:
+        """Shrink to working size and choose the pixels that will be matched."""
+        gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+        gray = cv2.resize(gray, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        px, strength = corner_grid(gray, self.cell_px)
+        texture = np.clip(strength / max(0.5 * float(np.median(strength)), 1e-5), 0.0, 1.0)
+        semantic = None
+        if frame.semantic is not None:
+            semantic = cv2.resize(frame.semantic.astype(np.float32), (self.width, self.height))
+        grid = (self.height // self.cell_px, self.width // self.cell_px)
+        return WorkFrame(
+            frame.index, frame.timestamp_s, gray, px, grid, texture, semantic, self._own_inv_depth(frame)
+        )
+
+    def _own_inv_depth(self, frame: Frame) -> Array | None:
+        return None
+
+    def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
+        """Match ref's pixels in new; points by ref's depth where it is known, by triangulation otherwise."""
+        found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow)
+        matches = Matches(ref.px, found.target, found.weight * ref.texture)
+        rays = guess.camera.rays(ref.px)
+        ref_map = _known_points(ref.px, rays, guess)
+        new_map = ref_map
+        if guess.new_from_ref is not None:
+            inv_depth, confidence = triangulate(matches, guess.new_from_ref, guess.camera)
+            points = rays / np.maximum(inv_depth, 1e-6)[:, None]
+            new_map = Pointmap(found.target, points, confidence)
+            if guess.ref_inv_depth is None:
+                ref_map = Pointmap(ref.px, points, confidence)
+        return PairPrediction(matches, ref_map, new_map, self._own_points(new, matches, guess.camera), found.dense)
+
+    def _own_points(self, new: WorkFrame, matches: Matches, camera: Camera) -> Pointmap | None:
+        return None
+
+
+def _known_points(px: Array, rays: Array, guess: Guess) -> Pointmap:
+    if guess.ref_inv_depth is None:
+        return Pointmap(px, rays, np.zeros(len(px)))
+    depth = 1 / np.maximum(guess.ref_inv_depth, 1e-6)
+    info = np.zeros(len(px)) if guess.ref_depth_info is None else guess.ref_depth_info
+    sigma_ratio = 1 / np.sqrt(np.maximum(info, 1e-12)) * depth
+    return Pointmap(px, rays * depth[:, None], 1 / (1 + (sigma_ratio / 0.1) ** 2))
+
+
+def triangulate(matches: Matches, new_from_ref: Array, camera: Camera) -> tuple[Array, Array]:
+    """Inverse depth (p,) in ref of each match under a known pose, and an honest confidence (p,) in 0..1.
+
+    Linear in the inverse depth: cross(ray_new, R ray_ref + t d) = 0. The confidence is the match's weight, times
+    how surely the parallax fixes the depth (1 px of noise), times how well the match keeps the epipolar line.
+    """
+    rotated = camera.rays(matches.ref_px) @ new_from_ref[:3, :3].T
+    rays_new = camera.rays(matches.new_px)
+    t = new_from_ref[:3, 3]
+    # pixel rows: x' (rz + tz d) = rx + tx d
+    a = t[:2] - rays_new[:, :2] * t[2]
+    b = rays_new[:, :2] * rotated[:, 2:] - rotated[:, :2]
+    norm = (a**2).sum(1)
+    inv_depth = (a * b).sum(1) / np.maximum(norm, 1e-12)
+    epipolar_px = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px
+    sigma = 1 / (np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px)
+    sure = 1 / (1 + (sigma / np.maximum(inv_depth, 1e-6) / 0.1) ** 2)
+    confidence = matches.weight * sure * np.exp(-0.5 * epipolar_px**2) * (inv_depth > 0)
+    return np.maximum(inv_depth, 1e-6), confidence
+
+
+class SensorDepthPointmaps(GeometricPointmaps):
+    """Provider whose depth comes with the frames (a TUM-layout folder): real pointmaps of a network's kind."""
+
+    name = "depth"
+    depth_sigma_ratio: float | None = 0.02
+
+    def _own_inv_depth(self, frame: Frame) -> Array | None:
+        if frame.depth_m is None:
+            return np.zeros((self.height, self.width), np.float32)
+        depth = cv2.resize(frame.depth_m, (self.width, self.height), interpolation=cv2.INTER_NEAREST)
+        return np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0).astype(np.float32)
+
+    def _own_points(self, new: WorkFrame, matches: Matches, camera: Camera) -> Pointmap | None:
+        return points_from_own_depth(new, matches.new_px, matches.weight, camera)
+
+
+def points_from_own_depth(frame: WorkFrame, px: Array, weight: Array, camera: Camera) -> Pointmap:
+    """A frame's own measured depth at ``px`` as points in its own camera; confidence 0 where it has none."""
+    inv_depth = sample_own(frame, px)
+    rays = camera.rays(px)
+    points = rays / np.maximum(inv_depth, 1e-6)[:, None]
+    return Pointmap(px, points, np.where(inv_depth > 0, weight, 0.0))
+
+
+def sample_own(frame: WorkFrame, px: Array) -> Array:
+    """Own inverse depth (p,) at the nearest pixel; 0 where none, at depth edges and outside."""
+    own = frame.own_inv_depth
+    if own is None:
+        return np.zeros(len(px))
+    low, high = cv2.erode(own, np.ones((3, 3))), cv2.dilate(own, np.ones((3, 3)))
+    smooth = np.where((low > 0) & (high < 1.05 * low), own, 0)
+    x = np.clip(np.round(px[:, 0]).astype(int), 0, own.shape[1] - 1)
+    y = np.clip(np.round(px[:, 1]).astype(int), 0, own.shape[0] - 1)
+    return smooth[y, x].astype(float)
+
+
+def camera_flow(inv_depth: Array, new_from_ref: Array, camera: Camera, grid_px: Array) -> Array:
+    """Flow (h, w, 2) float32 of a static scene with dense inverse depth (h, w) under a camera motion."""
+    rays = camera.rays(grid_px) if camera.k1 != 0.0 else _fast_rays(camera, grid_px)
+    points = transform(new_from_ref, rays / np.maximum(inv_depth, 1e-6)[..., None])
+    z = points[..., 2:]
+    points = np.concatenate([points[..., :2], np.where(z > 1e-6, np.maximum(z, 1e-6), 1e-6)], -1)
+    flow = camera.project(points) - grid_px
+    limit = 2.0 * max(camera.width, camera.height)
+    return np.clip(flow, -limit, limit).astype(np.float32)
+
+
+def _fast_rays(camera: Camera, grid_px: Array) -> Array:
+    xy = (grid_px - np.array([camera.cx_px, camera.cy_px])) / np.array([camera.fx_px, camera.fy_px])
+    return np.concatenate([xy, np.ones_like(xy[..., :1])], -1)

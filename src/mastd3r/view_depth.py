@@ -1,0 +1,101 @@
+"""Depth between the stages: what a view is expected to see, and the flow that follows from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .dynamics.data import DynamicsInput
+from .geometry.se3 import inverse
+from .graph.depth import carried, filled, upsampled
+from .graph.keyframe_graph import KeyframeGraph
+from .pointmap.geometric import camera_flow, sample_own
+from .types import WorkFrame
+
+Array = NDArray[Any]
+
+
+def static_at(moving: Array, px: Array) -> Array:
+    """(p,) P(static) at pixels of a P(moving) map (h, w); the nearest pixel inside counts."""
+    x = np.clip(np.round(px[:, 0]).astype(int), 0, moving.shape[1] - 1)
+    y = np.clip(np.round(px[:, 1]).astype(int), 0, moving.shape[0] - 1)
+    return 1.0 - moving[y, x].astype(float)
+
+
+def invert_flow(flow: Array, grid_px: Array) -> Array:
+    """Approximate flow new -> ref from flow ref -> new: one fixed-point step."""
+    return -cv2.remap(flow, grid_px - flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def chained_flow(first: Array, second: Array, grid_px: Array) -> Array:
+    """Flow a -> c from a -> b and b -> c."""
+    return first + cv2.remap(second, grid_px + first, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def own_depth_prior(work: WorkFrame, scale: float, sigma_ratio: float | None) -> tuple[Array, Array]:
+    """(p,) inverse depths that the frame measured itself, and their information; ones, unknown, where it did not.
+
+    ``scale`` brings the frame's own lengths to the graph's.
+    """
+    own = sample_own(work, work.px) / scale
+    known = own > 0
+    if sigma_ratio is None or not known.any():
+        return np.ones(len(work.px)), np.full(len(work.px), 1e-2)
+    inv_depth = np.where(known, own, float(np.median(own[known])))
+    info = np.where(known, 1 / (sigma_ratio * inv_depth) ** 2, 1e-2 / inv_depth**2)
+    return inv_depth, info
+
+
+def predicted_depth(
+    graph: KeyframeGraph, kf_id: int, cam_from_world: Array, work: WorkFrame, scale: float, sigma_ratio: float | None
+) -> tuple[Array, Array]:
+    """First inverse depths (p,) and information of a new keyframe: its own where measured, carried over otherwise."""
+    block = graph.blocks[kf_id]
+    if not graph.initialised:
+        return np.ones(len(work.px)), np.full(len(work.px), 1e-2)
+    new_from_ref = cam_from_world @ inverse(block.cam_from_world)
+    value, _ = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px)
+    median = float(np.median(value))
+    value = np.clip(value, 0.01 * median, 100 * median)
+    info = np.full(len(value), 1e-3 / median**2)
+    if sigma_ratio is not None:
+        own, own_info = own_depth_prior(work, scale, sigma_ratio)
+        measured = sample_own(work, work.px) > 0
+        value, info = np.where(measured, own, value), np.where(measured, own_info, info)
+    return value, info
+
+
+def dense_inv_depth(graph: KeyframeGraph, kf_id: int) -> Array:
+    """(h, w) float32 inverse depth of a keyframe, holes filled from their neighbours."""
+    kf, block = graph.keyframes[kf_id], graph.blocks[kf_id]
+    values = filled(block.inv_depth, graph.depth_info(kf_id), kf.work.grid)
+    return upsampled(values, kf.work.grid, *graph.size)
+
+
+def rigid_flow(graph: KeyframeGraph, i: int, j: int, grid_px: Array) -> Array:
+    """(h, w, 2) flow i -> j that the graph's poses and depths predict."""
+    j_from_i = graph.blocks[j].cam_from_world @ inverse(graph.blocks[i].cam_from_world)
+    return camera_flow(dense_inv_depth(graph, i), j_from_i, graph.camera().pinhole, grid_px)
+
+
+def dynamics_input(graph: KeyframeGraph, kf_id: int, world_from_cam: Array, work: WorkFrame, scale: float) -> DynamicsInput:
+    """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics."""
+    block, camera = graph.blocks[kf_id], graph.camera()
+    new_from_ref = inverse(world_from_cam) @ inverse(block.cam_from_world)
+    value, trusted = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
+    sigma = 0.1 * value * np.sqrt(1 / np.maximum(trusted, 1e-4) - 1) + 0.02 * value
+    own = None if work.own_inv_depth is None else work.own_inv_depth / np.float32(scale)
+    return DynamicsInput(
+        work.index,
+        work.timestamp_s,
+        work.gray,
+        camera,
+        world_from_cam,
+        upsampled(value, work.grid, *graph.size),
+        upsampled(sigma, work.grid, *graph.size),
+        own,
+        work.semantic,
+    )
