@@ -19,8 +19,8 @@ from .graph.bootstrap import bootstrap
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
 from .graph.places import covisible
 from .parts import Parts
-from .types import Frame, Guess, Matches, PairPrediction, State, WorkFrame
 from .sources.checks import frame_is_blank
+from .types import Frame, Guess, Matches, PairPrediction, State, WorkFrame
 from .view_depth import (
     chained_flow,
     dynamics_input,
@@ -64,7 +64,9 @@ class Slam:
     def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
         self.config, self.parts = config, parts
         width, height = parts.size
-        self.graph = KeyframeGraph(config.graph, config.camera, lens_for(config.camera, width, height, full_size))
+        self.graph = KeyframeGraph(
+            config.graph, config.camera, lens_for(config.camera, width, height, full_size)
+        )
         self.belief = DynamicBelief(config.dynamics, width, height)
         self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
         self._flow: Array | None = None  # latest keyframe -> last frame
@@ -79,7 +81,10 @@ class Slam:
         prior = self.belief.prior(work.gray, work.semantic)  # III-A, prior of (2)
         if not self.graph.keyframes:
             return self._start(work, prior)
-        kf, view = self.graph.latest, self._compare(self.graph.latest, work, prior, self._flow, self._cam_from_kf)
+        kf, view = (
+            self.graph.latest,
+            self._compare(self.graph.latest, work, prior, self._flow, self._cam_from_kf),
+        )
         if not self._believed(view):
             kf, view = self._retry(work, prior)
         if not self._believed(view):
@@ -92,7 +97,9 @@ class Slam:
             kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
         return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
 
-    def _compare(self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array) -> TwoView:
+    def _compare(
+        self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array
+    ) -> TwoView:
         """Predict, mask and align one pair. Tracking, loops and recovery all come here."""
         graph, started = self.graph, self.graph.initialised
         block = graph.blocks[ref.id]
@@ -157,7 +164,9 @@ class Slam:
         kf = self.graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
         self.graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
         self.graph.replace_last_by_keyframe(kf)
-        self.graph.initialised = self.parts.provider.depth_sigma_ratio is not None and bool((info > 1).mean() > 0.1)
+        self.graph.initialised = self.parts.provider.depth_sigma_ratio is not None and bool(
+            (info > 1).mean() > 0.1
+        )
         self._flow, self._cam_from_kf, self._last = None, np.eye(4), (work, prior)
         return StepReport(work.index, work.timestamp_s, "started", kf.id, True, "first view")
 

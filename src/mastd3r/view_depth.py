@@ -50,14 +50,21 @@ def own_depth_prior(work: WorkFrame, scale: float, sigma_ratio: float | None) ->
 
 
 def predicted_depth(
-    graph: KeyframeGraph, kf_id: int, cam_from_world: Array, work: WorkFrame, scale: float, sigma_ratio: float | None
+    graph: KeyframeGraph,
+    kf_id: int,
+    cam_from_world: Array,
+    work: WorkFrame,
+    scale: float,
+    sigma_ratio: float | None,
 ) -> tuple[Array, Array]:
     """First inverse depths (p,) and information of a new keyframe: its own where measured, carried over otherwise."""
     block = graph.blocks[kf_id]
     if not graph.initialised:
         return np.ones(len(work.px)), np.full(len(work.px), 1e-2)
     new_from_ref = cam_from_world @ inverse(block.cam_from_world)
-    value, _ = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px)
+    value, _ = carried(
+        block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px
+    )
     median = float(np.median(value))
     value = np.clip(value, 0.01 * median, 100 * median)
     info = np.full(len(value), 1e-3 / median**2)
@@ -81,11 +88,15 @@ def rigid_flow(graph: KeyframeGraph, i: int, j: int, grid_px: Array) -> Array:
     return camera_flow(dense_inv_depth(graph, i), j_from_i, graph.camera().pinhole, grid_px)
 
 
-def dynamics_input(graph: KeyframeGraph, kf_id: int, world_from_cam: Array, work: WorkFrame, scale: float) -> DynamicsInput:
+def dynamics_input(
+    graph: KeyframeGraph, kf_id: int, world_from_cam: Array, work: WorkFrame, scale: float
+) -> DynamicsInput:
     """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics."""
     block, camera = graph.blocks[kf_id], graph.camera()
     new_from_ref = inverse(world_from_cam) @ inverse(block.cam_from_world)
-    value, trusted = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
+    value, trusted = carried(
+        block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px
+    )
     sigma = 0.1 * value * np.sqrt(1 / np.maximum(trusted, 1e-4) - 1) + 0.02 * value
     own = None if work.own_inv_depth is None else work.own_inv_depth / np.float32(scale)
     return DynamicsInput(

@@ -54,7 +54,9 @@ def icp(
         moved = transform(pose, a)
         nearest_distance, nearest = tree.query(moved)
         own_distance = np.linalg.norm(moved - b, axis=1)
-        pair = np.where(own_distance <= 1.5 * nearest_distance + 0.01 * moved[:, 2], np.arange(len(a)), nearest)
+        pair = np.where(
+            own_distance <= 1.5 * nearest_distance + 0.01 * moved[:, 2], np.arange(len(a)), nearest
+        )
         if change < 1e-5:
             converged = True
             break

@@ -27,9 +27,7 @@ class OwnPoints:
     sigma_ratio: float  # 1-sigma of a point relative to its depth
 
 
-def point_terms(
-    moved: Array, own: Array, weight: Array, sigma: Array
-) -> tuple[Array, Array, float]:
+def point_terms(moved: Array, own: Array, weight: Array, sigma: Array) -> tuple[Array, Array, float]:
     """(7, 7), (7,) and cost of |own - moved|²/sigma² with a Cauchy kernel of 2 sigma.
 
     Tangent: left perturbation of new_from_ref (translation, rotation), log-scale of ``own``. ``own`` holds the
@@ -104,7 +102,14 @@ def _system(
 ) -> tuple[Array, Array, float]:
     hess, rhs = np.zeros((7, 7)), np.zeros(7)
     hess[:6, :6], rhs[:6], cost = pose_system(
-        matches.px, matches.inv_depth, matches.depth_info, matches.target, matches.weight, pose, matches.lens, kernel_px
+        matches.px,
+        matches.inv_depth,
+        matches.depth_info,
+        matches.target,
+        matches.weight,
+        pose,
+        matches.lens,
+        kernel_px,
     )
     if own is None:
         return hess, rhs, cost

@@ -12,7 +12,9 @@ from ..geometry.se3 import transform
 Array = NDArray[Any]
 
 
-def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array, min_points: int = 5) -> float:
+def patch_scale(
+    depth_pre: Array, depth_new: Array, patch: Array, weight: Array, min_points: int = 5
+) -> float:
     """Factor s that brings new's depths to the previous scale: median over patches of med(z_pre)/med(z_t).
 
     The paper prints the inverse ratio, which would double the error (paper-notes, (9)(10)).
@@ -29,7 +31,12 @@ def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array,
 
 
 def correct_scale(
-    points_ref: Array, points_new: Array, px: Array, weight: Array, new_from_ref: Array, patch_px: float = 64.0
+    points_ref: Array,
+    points_new: Array,
+    px: Array,
+    weight: Array,
+    new_from_ref: Array,
+    patch_px: float = 64.0,
 ) -> float:
     """Eq. (9) for matched clouds: depths of ref's points seen from new against new's own, patches of ``patch_px``."""
     depth_pre = transform(new_from_ref, points_ref)[:, 2]

@@ -18,19 +18,29 @@ from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
 from .depth import depth_log_ratio
 from .flow import HalfFlow
-from .motion import along_epipolar, flow_covariance, motion_log_ratio, rigid_flow, texture_information
-from .regions import guided, guided_coefficients
+from .motion import (
+    RigidFlow,
+    along_epipolar,
+    flow_covariance,
+    motion_log_ratio,
+    pose_jacobian,
+    residual_twist,
+    rigid_flow,
+    texture_information,
+)
+from .photo import mismatch, photo_variance
+from .regions import guided_coefficients, region_mean
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class _Past:
-    """What is kept of a frame: half-size grey image, pose, and the flow to the frame before it."""
+    """What is kept of a frame: half-size grey image and pose."""
 
     gray: Array
     world_from_cam: Array
-    to_previous: Array | None
+    moving: Array
 
 
 class DynamicBelief:
@@ -40,11 +50,13 @@ class DynamicBelief:
         self.config, self.width, self.height = config, width, height
         self._w, self._h = (width + 1) // 2, (height + 1) // 2
         self._flow = HalfFlow(self._w, self._h)
-        self._past: deque[_Past] = deque(maxlen=config.max_gap)
+        self._past: deque[_Past] = deque(maxlen=1 + max(config.gaps))
         self._belief: Array | None = None  # log-odds of evidence at half size, without the semantic prior
-        self._carried: tuple[Array, Array | None, Array] | None = None  # small gray, flow to last, carried belief
+        self._carried: tuple[Array, Array | None, Array] | None = (
+            None  # small gray, flow to last, carried belief
+        )
         self._camera: Camera | None = None
-        self._rays = np.zeros((self._h, self._w, 3), np.float32)
+        self._rays = np.zeros((3, self._h, self._w), np.float32)
 
     def prior(self, gray: Array, semantic: Array | None = None) -> Array:
         """P(moving) (h, w) float32 before the pose is known: the last posterior along the flow, and the semantics.
@@ -68,16 +80,21 @@ class DynamicBelief:
         if self.config.variant == "paper":
             return self._paper(given)
         small, to_last, carried = self._carry(given.gray)
-        self._past.append(_Past(small, given.world_from_cam, to_last))
+        self._past.append(_Past(small, given.world_from_cam, np.zeros_like(carried)))
         evidence: dict[str, Array] = {}
         fresh = np.zeros((self._h, self._w), np.float32)
         if self.config.use_motion:
-            evidence["motion"] = self._motion(given, small)
+            evidence["motion"] = self._motion(given, small, carried)
             fresh = fresh + evidence["motion"]
         if self.config.use_depth and given.own_inv_depth is not None:
             evidence["depth"] = self._shrink(depth_log_ratio(given, self.config))
             fresh = fresh + evidence["depth"]
         evidence["time"] = carried
+        if self.config.use_regions:
+            weight = 0.02 + np.abs(fresh) / (1 + np.abs(fresh))
+            fresh = region_mean(
+                small.astype(np.float32), fresh, weight, self.config.region_px, self.config.region_contrast
+            )
         belief = carried + self.config.evidence_gain * fresh
         limit = self.config.max_log_odds
         belief = np.clip(belief, -limit, limit).astype(np.float32)
@@ -88,45 +105,73 @@ class DynamicBelief:
         self._belief = belief
         self._carried = None
         probability = _sigmoid(shown + semantic)
+        self._past[-1] = _Past(small, given.world_from_cam, self._shrink(probability))
         return DynamicMask(probability, probability > 0.5, evidence)
 
-    def _motion(self, given: DynamicsInput, small: Array) -> Array:
-        none = np.zeros((self._h, self._w), np.float32)
+    def _motion(self, given: DynamicsInput, small: Array, carried: Array) -> Array:
+        """Sum of the motion log ratios against one near and one far past frame, (h', w') float32."""
+        total = np.zeros((self._h, self._w), np.float32)
         if len(self._past) < 2:
-            return none
+            return total
         inv_depth, sigma = self._depth(given)
-        gap, to_past = self._pick_gap(small)
-        past = self._past[-1 - gap]
-        back = self._flow.between(past.gray, small)
-        error = self._flow.round_trip_px(to_past, back)
-        camera, rays = self._lens(given.camera)
-        past_from_cur = inverse(past.world_from_cam) @ given.world_from_cam
-        rigid = rigid_flow(camera, rays, past_from_cur, inv_depth)
         information = texture_information(small, 7, self.config.texture_noise)
         cov = flow_covariance(information, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
-        residual = to_past - rigid.flow
-        cov = cov + (0.5 * np.minimum(error, 8.0) ** 2)[..., None] * np.array([1, 0, 1], np.float32)
-        cov = along_epipolar(cov, rigid.slope, sigma)
-        ratio = motion_log_ratio(residual, cov, self.config)
-        trust = np.exp(-0.5 * (error / 1.5) ** 2) * rigid.in_front
-        return (ratio * trust).astype(np.float32)
+        static = 1 / (1 + np.exp(carried))
+        for gap in self._gaps():
+            past = self._past[-1 - gap]
+            camera, rays = self._lens(given.camera)
+            rigid = rigid_flow(camera, rays, inverse(past.world_from_cam) @ given.world_from_cam, inv_depth)
+            stable = self._flow.warp(past.gray, rigid.target)
+            residual = self._flow.between(small, stable)
+            inside = self._inside(rigid)
+            cur, still = small.astype(np.float32), stable.astype(np.float32)
+            still = still * (float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3))
+            noise = photo_variance(information, self.config)
+            as_static = mismatch(cur, still, noise)
+            as_flow = mismatch(cur, self._flow.pull(still, residual), noise)
+            if self.config.round_trip_px > 0:
+                error = self._flow.round_trip_px(residual, self._flow.between(stable, small))
+                trust = np.exp(-0.5 * (error / self.config.round_trip_px) ** 2) * inside
+            else:
+                trust = np.exp(-0.5 * np.maximum(as_flow - 1, 0)) * inside
+            residual = residual - self._pose_error(rigid, residual, trust * static, camera.fx_px)
+            wide = along_epipolar(cov, rigid.slope, sigma)
+            covered = self._flow.warp(past.moving, rigid.target)
+            clash = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * (1 - trust) * (1 - covered)
+            fits = np.clip(self.config.photo_gain * (as_static - as_flow), -3, 0)
+            total += motion_log_ratio(residual, wide, self.config) * trust
+            total += inside * (self.config.clash_gain * clash + fits)
+        return total
 
-    def _pick_gap(self, small: Array) -> tuple[int, Array]:
-        """(gap, flow to that past frame): the first whose median motion suffices, by chaining the stored flows."""
-        flow = self._past[-1].to_previous
-        gap = 1
-        assert flow is not None
-        while gap < min(len(self._past) - 1, self.config.max_gap):
-            if float(np.median(np.linalg.norm(flow[::4, ::4], axis=-1))) >= self.config.gap_motion_px:
-                break
-            step = self._past[-1 - gap].to_previous
-            if step is None:
-                break
-            flow = self._flow.chain(flow, step)
-            gap += 1
-        if gap > 1:
-            flow = self._flow.between(small, self._past[-1 - gap].gray, flow)
-        return gap, flow
+    def _gaps(self) -> list[int]:
+        return sorted({g for g in self.config.gaps if g < len(self._past)}) or [1]
+
+    def _inside(self, rigid: RigidFlow) -> Array:
+        x, y = rigid.target[..., 0], rigid.target[..., 1]
+        inside = (x > 0) & (y > 0) & (x < self._w - 1) & (y < self._h - 1) & (rigid.inv_depth >= 0)
+        return inside.astype(np.float32)
+
+    def _pose_error(self, rigid: RigidFlow, residual: Array, weight: Array, focal_px: float) -> Array:
+        """The part of the residual that a small error of the relative pose explains, (h', w', 2) float32."""
+        step = slice(3, None, 6)
+        near = float(np.median(rigid.inv_depth[step, step])) + 1e-9
+        limit = np.deg2rad(self.config.pose_doubt_deg)
+        sigma = np.array([limit / near] * 3 + [limit] * 3)
+        part = pose_jacobian(
+            rigid.xy[step, step].reshape(-1, 2), rigid.inv_depth[step, step].ravel(), focal_px
+        )
+        twist = residual_twist(
+            part.astype(float),
+            residual[step, step].reshape(-1, 2).astype(float),
+            weight[step, step].ravel().astype(float),
+            self.config.flow_noise_px,
+            sigma,
+        )
+        x, y = rigid.xy[..., 0], rigid.xy[..., 1]
+        v, w = (focal_px * twist[:3]).astype(np.float32), (focal_px * twist[3:]).astype(np.float32)
+        along_x = rigid.inv_depth * (v[0] - x * v[2]) - x * y * w[0] + (1 + x * x) * w[1] - y * w[2]
+        along_y = rigid.inv_depth * (v[1] - y * v[2]) - (1 + y * y) * w[0] + x * y * w[1] + x * w[2]
+        return cv2.merge([along_x.astype(np.float32), along_y.astype(np.float32)])
 
     def _carry(self, gray: Array) -> tuple[Array, Array | None, Array]:
         """(half-size image, flow to the last frame, evidence carried along it and faded)."""
@@ -139,7 +184,15 @@ class DynamicBelief:
         if self._past:
             to_last = self._flow.between(small, self._past[-1].gray)
             if self.config.use_time and self._belief is not None:
-                carried = self.config.memory * self._flow.pull(self._belief, to_last)
+                seen = self._flow.pull(self._past[-1].gray.astype(np.float32), to_last, -100.0)
+                noise = photo_variance(texture_information(small, 5, self.config.texture_noise), self.config)
+                same = np.exp(
+                    -0.5
+                    * np.maximum(
+                        mismatch(small.astype(np.float32), seen, noise) - self.config.carry_mismatch, 0
+                    )
+                )
+                carried = self.config.memory * same * self._flow.pull(self._belief, to_last)
         self._carried = (small, to_last, carried)
         return self._carried
 
@@ -156,7 +209,7 @@ class DynamicBelief:
         small = camera.resized(self._w, self._h)
         if small != self._camera:
             self._camera = small
-            self._rays = small.rays(small.pixel_grid()).astype(np.float32)
+            self._rays = np.moveaxis(small.rays(small.pixel_grid()), -1, 0).astype(np.float32)
         return small, self._rays
 
     def _semantic_log_odds(self, semantic: Array | None) -> Array:
@@ -173,7 +226,7 @@ class DynamicBelief:
             return self._full(belief)
         weight = 0.05 + np.minimum(np.abs(belief), 3.0) / 3
         a, b = guided_coefficients(
-            small.astype(np.float32), belief, weight, self.config.region_px, self.config.region_contrast
+            small.astype(np.float32), belief, weight, self.config.edge_px, self.config.region_contrast
         )
         limit = self.config.max_log_odds
         return np.clip(self._full(a) * given.gray + self._full(b), -limit, limit).astype(np.float32)
@@ -189,7 +242,10 @@ class DynamicBelief:
         log_odds = paper.posterior_log_odds(prior, moving, static)
         mask = paper.coarse_mask(paper.moving_mask(log_odds, c.tau_bayes), anomaly)
         probability = np.where(mask, _sigmoid(log_odds), np.minimum(_sigmoid(log_odds), 0.5) * anomaly)
-        evidence = {"depth": np.log(moving / static).astype(np.float32), "anomaly": anomaly.astype(np.float32)}
+        evidence = {
+            "depth": np.log(moving / static).astype(np.float32),
+            "anomaly": anomaly.astype(np.float32),
+        }
         return DynamicMask(probability.astype(np.float32), mask, evidence)
 
     def _shrink(self, image: Array) -> Array:
@@ -200,7 +256,9 @@ class DynamicBelief:
 
     def _check(self, image: Array, name: str) -> None:
         if image.shape != (self.height, self.width):
-            raise InputError(f"dynamics: expected {name} of {self.width}x{self.height}, got shape {image.shape}")
+            raise InputError(
+                f"dynamics: expected {name} of {self.width}x{self.height}, got shape {image.shape}"
+            )
 
 
 def _sigmoid(log_odds: Array) -> Array:

@@ -25,13 +25,20 @@ class DynamicsConfig:
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
     texture_noise: float = 4.0  # grey levels of noise that a texture has to beat
     motion_spread_px: float = 4.0  # 1 sigma of what a moving thing adds to the flow
-    still_share: float = 0.3  # share of a moving thing's pixels that show no motion against the background
+    still_share: float = 0.1  # share of a moving thing's pixels that show no motion against the background
     outlier_share: float = 0.03  # share of static pixels whose flow is simply wrong
-    gap_motion_px: float = 6.0  # camera motion wanted between the frame and the past frame it is compared with
-    max_gap: int = 8  # frames
+    gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with
+    photo_noise: float = 5.0  # grey levels, 1 sigma of an aligned static pixel
+    photo_shift_px: float = 0.4  # misalignment that a static pixel may show
+    photo_gain: float = 0.3  # weight of grey values that fit the rigid flow better than the measured one
+    clash_gain: float = 1.2  # weight of grey values that no static scene explains
+    carry_mismatch: float = 10.0  # normalised grey mismatch from which the carried belief fades
+    round_trip_px: float = 1.5  # forward-backward error at which the flow is half believed
+    pose_doubt_deg: float = 0.3  # 1 sigma of the small pose error that the motion test may take out
     depth_noise_ratio: float = 0.03  # noise of the frame's own depth, as a share of it
-    region_px: int = 10  # radius of the joint smoothing
-    region_contrast: float = 8.0  # grey levels that count as an edge for it
+    region_px: float = 20.0  # radius of the joint smoothing
+    edge_px: int = 4
+    region_contrast: float = 30.0  # grey levels that count as an edge for it
 
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth
     tau_sigma: float = 2.5  # eq. (1) k

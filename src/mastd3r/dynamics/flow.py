@@ -22,14 +22,25 @@ class HalfFlow:
 
     def between(self, a: Array, b: Array, start: Array | None = None) -> Array:
         """(h, w, 2) float32 flow a -> b."""
-        flow: Array = self._dis.calc(a, b, None if start is None else np.ascontiguousarray(start.astype(np.float32)))
+        flow: Array = self._dis.calc(
+            a, b, None if start is None else np.ascontiguousarray(start.astype(np.float32))
+        )
         return flow
 
     def pull(self, value: Array, flow: Array, outside: float = 0.0) -> Array:
         """``value`` of the flow's target image seen from its origin; ``outside`` where the flow leaves it."""
         return cv2.remap(
-            value, self.grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=outside
+            value,
+            self.grid + flow,
+            None,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=outside,
         )
+
+    def warp(self, image: Array, target: Array) -> Array:
+        """``image`` read at ``target`` (h, w, 2) pixels; the border is repeated."""
+        return cv2.remap(image, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
     def chain(self, ab: Array, bc: Array) -> Array:
         """Flow a -> c."""
@@ -38,7 +49,11 @@ class HalfFlow:
     def round_trip_px(self, forward: Array, backward: Array) -> Array:
         """(h, w) length of forward + backward; large where either leaves the image or is occluded."""
         back = cv2.remap(
-            backward, self.grid + forward, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+            backward,
+            self.grid + forward,
+            None,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
             borderValue=(1e3, 1e3),
         )
         return np.linalg.norm(forward + back, axis=-1)

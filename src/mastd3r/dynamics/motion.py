@@ -17,28 +17,57 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class RigidFlow:
-    """Where a static scene's pixels would go, and how that changes with inverse depth."""
+    """Where a static scene's pixels would go, how that changes with inverse depth and with the pose."""
 
-    flow: Array  # (h, w, 2) float32 px
+    target: Array  # (h, w, 2) float32 pixels in the past image
     slope: Array  # (h, w, 2) float32 px per unit of inverse depth: the epipolar direction and its gain
-    in_front: Array  # (h, w) bool
+    xy: Array  # (h, w, 2) float32 target on the past camera's unit plane
+    inv_depth: Array  # (h, w) float32 seen from the past camera; <= 0 behind it
 
 
 def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Array) -> RigidFlow:
-    """Flow current -> past of a static scene. ``rays`` (h, w, 3) float32 with z = 1, ``inv_depth`` (h, w) >= 0."""
-    rotation, t = past_from_cur[:3, :3].astype(np.float32), past_from_cur[:3, 3].astype(np.float32)
-    point = rays @ rotation.T + inv_depth[..., None].astype(np.float32) * t
-    z = np.maximum(point[..., 2:], 1e-3)
-    xy = point[..., :2] / z
-    slope = (t[:2] - xy * t[2]) / z
-    focal = np.array([camera.fx_px, camera.fy_px], np.float32)
-    centre = np.array([camera.cx_px, camera.cy_px], np.float32)
+    """A static scene's flow current -> past. ``rays`` (3, h, w) float32 with z = 1, ``inv_depth`` (h, w) >= 0."""
+    m = past_from_cur.astype(np.float32)
+    x, y, z = (m[i, 0] * rays[0] + m[i, 1] * rays[1] + m[i, 2] + m[i, 3] * inv_depth for i in range(3))
+    scale = 1 / np.maximum(z, 1e-3)
+    x, y = x * scale, y * scale
+    dx, dy = (m[0, 3] - x * m[2, 3]) * scale, (m[1, 3] - y * m[2, 3]) * scale
+    u, v = x, y
     if camera.k1 != 0.0:
-        squared = (xy * xy).sum(-1, keepdims=True)
-        slope = slope * (1 + camera.k1 * squared) + 2 * camera.k1 * xy * (xy * slope).sum(-1, keepdims=True)
-        xy = xy * (1 + camera.k1 * squared)
-    start = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in rays.shape[1::-1])), -1)
-    return RigidFlow(xy * focal + centre - start, slope * focal, point[..., 2] > 1e-3)
+        bend = 1 + camera.k1 * (x * x + y * y)
+        pull = 2 * camera.k1 * (x * dx + y * dy)
+        dx, dy = dx * bend + x * pull, dy * bend + y * pull
+        u, v = x * bend, y * bend
+    target = cv2.merge([u * camera.fx_px + camera.cx_px, v * camera.fy_px + camera.cy_px])
+    slope = cv2.merge([dx * camera.fx_px, dy * camera.fy_px])
+    return RigidFlow(target, slope, cv2.merge([x, y]), inv_depth * scale * np.where(z > 1e-3, 1.0, -1.0))
+
+
+def pose_jacobian(xy: Array, inv_depth: Array, focal_px: float) -> Array:
+    """(..., 2, 6) change of a pixel with a small twist [v, w] of its camera's view, at unit-plane points (..., 2)."""
+    x, y = xy[..., 0], xy[..., 1]
+    zero = np.zeros_like(x)
+    rows_x = [inv_depth, zero, -x * inv_depth, -x * y, 1 + x * x, -y]
+    rows_y = [zero, inv_depth, -y * inv_depth, -(1 + y * y), x * y, x]
+    return focal_px * np.stack([np.stack(rows_x, -1), np.stack(rows_y, -1)], -2)
+
+
+def residual_twist(
+    jacobian: Array, residual: Array, weight: Array, noise_px: float, prior_sigma: Array
+) -> Array:
+    """(6,) twist that explains the residual (n, 2) of the static majority: reweighted least squares, Cauchy weights.
+
+    ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): how far a pose may be off before it is doubted.
+    """
+    twist = np.zeros(6)
+    scale = 4 * noise_px
+    for _ in range(6):
+        left = residual - jacobian @ twist
+        w = weight / (1 + (left**2).sum(-1) / scale**2) / noise_px**2
+        normal = np.einsum("nki,n,nkj->ij", jacobian, w, jacobian) + np.diag(1 / prior_sigma**2)
+        twist = np.linalg.solve(normal, np.einsum("nki,n,nk->i", jacobian, w, residual))
+        scale = max(0.6 * scale, 1.5 * noise_px)
+    return twist
 
 
 def texture_information(gray: Array, window_px: int, noise: float) -> tuple[Array, Array, Array]:

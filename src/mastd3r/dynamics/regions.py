@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +18,9 @@ def box(image: Array, radius_px: int) -> Array:
     return cv2.blur(image, (size, size), borderType=cv2.BORDER_REFLECT)
 
 
-def guided_coefficients(guide: Array, value: Array, weight: Array, radius_px: int, edge: float) -> tuple[Array, Array]:
+def guided_coefficients(
+    guide: Array, value: Array, weight: Array, radius_px: int, edge: float
+) -> tuple[Array, Array]:
     """(a, b), each (h, w): around every pixel value ~ a·guide + b, a weighted least-squares line.
 
     ``edge`` is the guide's contrast (its own unit) that counts as an edge; the slope fades where the weights do.
@@ -38,3 +41,50 @@ def guided(guide: Array, value: Array, weight: Array, radius_px: int, edge: floa
     """``value`` (h, w) float32 smoothed inside the edges of ``guide``; pixels of weight 0 are filled in."""
     a, b = guided_coefficients(guide, value, weight, radius_px, edge)
     return a * guide + b
+
+
+def region_mean(guide: Array, value: Array, weight: Array, radius_px: float, edge: float) -> Array:
+    """Weighted mean of ``value`` over the region that each pixel belongs to, (h, w) float32.
+
+    A recursive filter in the domain transform of ``guide`` (Gastal, Oliveira 2011): an edge of ``edge`` grey levels
+    is as long a way as ``radius_px`` pixels. Unlike a window it follows regions of any shape.
+    """
+    step_x = 1 + radius_px / edge * np.abs(np.diff(guide, axis=1))
+    step_y = 1 + radius_px / edge * np.abs(np.diff(guide, axis=0))
+    both = np.stack([value * weight, weight], -1).astype(np.float32)
+    rounds = 3
+    for i in range(rounds):
+        sigma = radius_px * np.sqrt(3) * 2 ** (rounds - 1 - i) / np.sqrt(4**rounds - 1)
+        decay = np.float32(-np.sqrt(2) / sigma)
+        _recursive_x(both, np.exp(decay * step_x).astype(np.float32))
+        _recursive_y(both, np.exp(decay * step_y).astype(np.float32))
+    return both[..., 0] / np.maximum(both[..., 1], np.float32(1e-6))
+
+
+@numba.njit(cache=True, fastmath=False)
+def _recursive_x(both: Array, pass_on: Array) -> None:
+    h, w, n = both.shape
+    for y in range(h):
+        for x in range(1, w):
+            a = pass_on[y, x - 1]
+            for k in range(n):
+                both[y, x, k] += a * (both[y, x - 1, k] - both[y, x, k])
+        for x in range(w - 2, -1, -1):
+            a = pass_on[y, x]
+            for k in range(n):
+                both[y, x, k] += a * (both[y, x + 1, k] - both[y, x, k])
+
+
+@numba.njit(cache=True, fastmath=False)
+def _recursive_y(both: Array, pass_on: Array) -> None:
+    h, w, n = both.shape
+    for y in range(1, h):
+        for x in range(w):
+            a = pass_on[y - 1, x]
+            for k in range(n):
+                both[y, x, k] += a * (both[y - 1, x, k] - both[y, x, k])
+    for y in range(h - 2, -1, -1):
+        for x in range(w):
+            a = pass_on[y, x]
+            for k in range(n):
+                both[y, x, k] += a * (both[y + 1, x, k] - both[y, x, k])

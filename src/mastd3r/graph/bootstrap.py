@@ -38,7 +38,11 @@ def bootstrap(graph: KeyframeGraph) -> bool:
         graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose, depth
     graph.normalise()
     graph.initialised = True
-    log.info("started with %d keyframes, focal %.0f px at working size", len(graph.keyframes), np.exp(graph.lens.g[0]))
+    log.info(
+        "started with %d keyframes, focal %.0f px at working size",
+        len(graph.keyframes),
+        np.exp(graph.lens.g[0]),
+    )
     return True
 
 
@@ -50,7 +54,14 @@ def _attempt(graph: KeyframeGraph, lens: Lens) -> float | None:
         return None
     frozen = Lens(lens.g, lens.prior, np.full(4, np.inf))
     done = [0, 1]
-    solve({k: graph.blocks[k] for k in done}, graph.edges_among(done), frozen, fixed=frozenset([0]), iterations=15, kernel_px=2.0)
+    solve(
+        {k: graph.blocks[k] for k in done},
+        graph.edges_among(done),
+        frozen,
+        fixed=frozenset([0]),
+        iterations=15,
+        kernel_px=2.0,
+    )
     for k in range(2, len(graph.keyframes)):
         before, block = graph.blocks[k - 1], graph.blocks[k]
         block.cam_from_world = before.cam_from_world

@@ -134,7 +134,11 @@ def _gather(blocks: dict[int, Block], edges: list[Edge]) -> tuple[Array, Array, 
 
 
 def _linearise(
-    blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, row_of: dict[int, int], kernel_px: float
+    blocks: dict[int, Block],
+    by_host: dict[int, list[Edge]],
+    lens: Lens,
+    row_of: dict[int, int],
+    kernel_px: float,
 ) -> tuple[Array, Array, dict[int, _Host], float]:
     size = 6 * len(row_of) + N_GLOBAL
     hess, rhs = np.zeros((size, size)), np.zeros(size)
@@ -152,7 +156,9 @@ def _linearise(
         hdd_i = block.depth_info + block.prior_info + 1e-9
         bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
         local_h, local_b, cross = _host_local(h, b, e, j_from_i)
-        columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
+        columns = np.concatenate(
+            [_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols]
+        )
         scaled = cross / hdd_i[:, None]
         local_h -= scaled.T @ cross
         local_b -= scaled.T @ bd_i
@@ -217,7 +223,9 @@ def _apply(
     return saved
 
 
-def _restore(blocks: dict[int, Block], lens: Lens, saved: tuple[Array, dict[int, tuple[Array, Array]]]) -> None:
+def _restore(
+    blocks: dict[int, Block], lens: Lens, saved: tuple[Array, dict[int, tuple[Array, Array]]]
+) -> None:
     lens.g = saved[0]
     for k, (pose, depth) in saved[1].items():
         blocks[k].cam_from_world, blocks[k].inv_depth = pose, depth
@@ -237,5 +245,7 @@ def _cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, 
     for i, edges in by_host.items():
         target, weight, j_from_i = _gather(blocks, edges)
         block = blocks[i]
-        total += float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
+        total += float(
+            host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum()
+        )
     return total

@@ -110,7 +110,13 @@ class KeyframeGraph:
         return True
 
     def record(
-        self, work: WorkFrame, kf_id: int, cam_from_kf: Array, state: State, matches: Matches | None, weight: Array
+        self,
+        work: WorkFrame,
+        kf_id: int,
+        cam_from_kf: Array,
+        state: State,
+        matches: Matches | None,
+        weight: Array,
     ) -> FrameRecord:
         """Store a frame's place; its strongest matches are kept for the final pose."""
         keep = np.zeros(0, int)
@@ -119,7 +125,14 @@ class KeyframeGraph:
             keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
         target = np.zeros((0, 2), np.float32) if matches is None else matches.new_px[keep].astype(np.float32)
         entry = FrameRecord(
-            work.index, work.timestamp_s, kf_id, cam_from_kf, state, keep, target, weight[keep].astype(np.float32)
+            work.index,
+            work.timestamp_s,
+            kf_id,
+            cam_from_kf,
+            state,
+            keep,
+            target,
+            weight[keep].astype(np.float32),
         )
         self.records.append(entry)
         return entry
@@ -148,7 +161,11 @@ class KeyframeGraph:
         near = active | {e.j for e in edges}
         whole = len(near) == n and n <= size
         fixed = frozenset([0]) if whole else frozenset((near - active) | {min(active)})
-        lens = self.lens if n <= 2 * size or n % 4 == 0 else Lens(self.lens.g, self.lens.prior, np.full(4, np.inf))
+        lens = (
+            self.lens
+            if n <= 2 * size or n % 4 == 0
+            else Lens(self.lens.g, self.lens.prior, np.full(4, np.inf))
+        )
         report = solve(
             {k: self.blocks[k] for k in sorted(near)},
             edges,

@@ -69,7 +69,10 @@ class FlowMatcher:
         xy = forward[:, 0]
         target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
         inside = (
-            (target[:, 0] > 1) & (target[:, 1] > 1) & (target[:, 0] < self.width - 2) & (target[:, 1] < self.height - 2)
+            (target[:, 0] > 1)
+            & (target[:, 1] > 1)
+            & (target[:, 0] < self.width - 2)
+            & (target[:, 1] < self.height - 2)
         )
         ok = inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < self.tolerance_px) & (moved < 6.0)
         weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
@@ -84,7 +87,9 @@ def corner_grid(gray: Array, cell_px: int) -> tuple[Array, Array]:
     strength = cv2.cornerMinEigenVal(gray, 5, ksize=3)
     h, w = gray.shape[0] // cell_px * cell_px, gray.shape[1] // cell_px * cell_px
     rows, cols = h // cell_px, w // cell_px
-    cells = strength[:h, :w].reshape(rows, cell_px, cols, cell_px).transpose(0, 2, 1, 3).reshape(rows * cols, -1)
+    cells = (
+        strength[:h, :w].reshape(rows, cell_px, cols, cell_px).transpose(0, 2, 1, 3).reshape(rows * cols, -1)
+    )
     best = cells.argmax(1)
     cy, cx = np.divmod(np.arange(rows * cols), cols)
     px = np.stack([cx * cell_px + best % cell_px, cy * cell_px + best // cell_px], 1).astype(float)

@@ -1,0 +1,221 @@
+"""What each command of the command line does."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.table import Table
+
+from . import __version__
+from .config import Config, config_from_dict, config_from_yaml, config_to_yaml, with_override
+from .errors import ConfigError
+
+DEMO_SEED = 0
+
+
+def dispatch(words: list[str]) -> int:
+    """Parse and run one command; returns the exit code."""
+    parser = _parser()
+    args = parser.parse_args(words)
+    console = Console(stderr=True)
+    logging.basicConfig(
+        level=logging.INFO if args.verbose else logging.WARNING,
+        format="%(message)s",
+        handlers=[RichHandler(console=console, show_path=False, show_time=False)],
+        force=True,
+    )
+    args.words = ["mastd3r", *words]
+    code: int = args.act(args, console)
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="mastd3r", description="Trajectory, static map and clean splat from a video."
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    parser.add_argument("-v", "--verbose", action="store_true", help="say more")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _run_parser(commands.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
+    demo = commands.add_parser(
+        "demo", help="make a small clip with a moving object and run the whole job on it"
+    )
+    demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
+    demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
+    demo.set_defaults(act=_demo)
+    ev = commands.add_parser("eval", help="score a run folder against a sequence with truth")
+    ev.add_argument("run", type=Path)
+    ev.add_argument("sequence", type=Path)
+    ev.set_defaults(act=_eval)
+    export = commands.add_parser("export", help="write a run's trajectory or splat in another format")
+    export.add_argument("run", type=Path)
+    export.add_argument("--to", choices=("tum", "kitti", "colmap"), required=True)
+    export.add_argument("--out", type=Path, required=True, help="file (tum, kitti) or folder (colmap)")
+    export.set_defaults(act=_export)
+    view = commands.add_parser("view", help="open a run's report in the browser")
+    view.add_argument("run", type=Path)
+    view.set_defaults(act=_view)
+    doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
+    doctor.set_defaults(act=_doctor)
+    return parser
+
+
+def _run_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("source", type=Path, help="video, folder of images, or TUM-layout folder")
+    p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
+    p.add_argument(
+        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml"
+    )
+    p.add_argument("--pointmaps", choices=("auto", "geometric", "mast3r", "depth"))
+    p.add_argument("--semantics", choices=("auto", "none", "dinov2", "maps"))
+    p.add_argument(
+        "--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp"
+    )
+    p.add_argument("--correction", choices=("none", "coarse", "fine", "coarse-to-fine"))
+    p.add_argument("--map-loss", choices=("plain", "mask", "uncertainty", "full"))
+    p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
+    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1]", help="pixels of the full-size image")
+    p.add_argument("--start", type=int, help="first frame, from 0")
+    p.add_argument("--end", type=int, help="one past the last frame")
+    p.add_argument("--stride", type=int, help="every n-th frame")
+    p.add_argument("--seed", type=int)
+    p.add_argument("--quiet", action="store_true", help="no progress bars")
+    p.set_defaults(act=_run)
+
+
+def config_from_args(args: argparse.Namespace) -> Config:
+    """Defaults, then the file, then --set, then the named options."""
+    config = config_from_yaml(args.config) if args.config else Config()
+    for item in args.set:
+        config = with_override(config, item)
+    for name in ("pointmaps", "semantics", "correction", "seed"):
+        if getattr(args, name) is not None:
+            config = replace(config, **{name: getattr(args, name)})
+    window = {k: getattr(args, k) for k in ("start", "end", "stride") if getattr(args, k) is not None}
+    config = replace(config, source=replace(config.source, **window))
+    if args.map_loss is not None:
+        config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
+    if args.no_map:
+        config = replace(config, mapping=replace(config.mapping, enabled=False))
+    if args.maps is not None and config.semantics == "auto":
+        config = replace(config, semantics="maps")
+    if args.intrinsics is not None:
+        config = replace(config, camera=replace(config.camera, intrinsics=_numbers(args.intrinsics)))
+    return config
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(x) for x in text.replace(",", " ").split())
+    except ValueError as e:
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy[,k1], got {text!r}") from e
+
+
+def _run(args: argparse.Namespace, console: Console) -> int:
+    config = config_from_args(args)
+    return _run_and_show(args.source, args.out, config, args.words, console, quiet=args.quiet, maps=args.maps)
+
+
+def _run_and_show(
+    source: Path,
+    out: Path,
+    config: Config,
+    words: list[str],
+    console: Console,
+    *,
+    quiet: bool = False,
+    maps: Path | None = None,
+) -> int:
+    from .progress import Silent, Terminal
+    from .run import run
+
+    result = run(
+        source, out, config, command=words, reporter=Silent() if quiet else Terminal(console), maps=maps
+    )
+    Console().print(_table(result.metrics))
+    Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]")
+    return 0
+
+
+def _table(metrics: dict[str, Any]) -> Table:
+    from .export.metric_names import described, in_order, shown
+
+    table = Table(show_header=False)
+    for key, value in in_order(metrics):
+        table.add_row(described(key), shown(key, value))
+    return table
+
+
+def _demo(args: argparse.Namespace, console: Console) -> int:
+    from .sources.synthetic import make_room_clip
+
+    if args.frames < 30:
+        raise ConfigError(f"--frames: expected at least 30, got {args.frames}")
+    with tempfile.TemporaryDirectory() as folder:
+        clip = Path(folder) / "room"
+        with console.status("making the clip: a furnished room with a moving ball"):
+            make_room_clip(clip, frames=args.frames, seed=DEMO_SEED)
+        code = _run_and_show(clip, args.out, Config(), args.words, console)
+        shutil.copy(
+            clip / "rgb" / sorted(p.name for p in (clip / "rgb").iterdir())[0], args.out / "first_frame.png"
+        )
+    return code
+
+
+def _eval(args: argparse.Namespace, console: Console) -> int:
+    from .evaluation.evaluate import evaluate
+    from .export.files import write_json
+    from .export.read_run import read_run
+    from .sources import open_source
+
+    recorded = read_run(args.run)
+    config = config_from_dict(yaml.safe_load(recorded.config) or {}) if recorded.config else Config()
+    source = open_source(args.sequence, config.source)
+    found = evaluate(args.run, source.truth(), source.frames()).metrics
+    metrics = {**recorded.metrics, **found}
+    write_json(args.run / "metrics.json", metrics)
+    Console().print(_table(metrics))
+    return 0
+
+
+def _export(args: argparse.Namespace, console: Console) -> int:
+    from .export.formats import export_run
+
+    written = export_run(args.run, args.to, args.out)
+    Console().print(f"wrote {written}")
+    return 0
+
+
+def _view(args: argparse.Namespace, console: Console) -> int:
+    import webbrowser
+
+    from .export.read_run import read_run
+
+    report = read_run(args.run).path / "report.html"
+    if not report.is_file():
+        raise ConfigError(f"{report}: expected the report of a complete run, got none")
+    Console().print(f"opening {report}")
+    webbrowser.open(report.resolve().as_uri())
+    return 0
+
+
+def _doctor(args: argparse.Namespace, console: Console) -> int:
+    from .export.machine import machine_info
+
+    table = Table(show_header=False)
+    for key, value in machine_info().items():
+        table.add_row(key, str(value))
+    Console().print(table)
+    Console().print("pointmaps auto: geometric (no weights needed) · splat backend: cpu (numba)")
+    Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
+    return 0

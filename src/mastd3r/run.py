@@ -1,0 +1,274 @@
+"""Source in, run folder out: the stages in order, their timings, and what is saved when one of them stops."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .config import Config, config_to_yaml
+from .errors import ConfigError, InputError, SlamError
+from .evaluation.evaluate import evaluate
+from .evaluation.image_error import psnr
+from .export.machine import peak_rss_mib
+from .export.read_run import read_run
+from .export.report import write_report
+from .export.report_data import gather_report_data
+from .export.run_folder import RunFolder
+from .finish import FinalFrame, final_frames, finish_graph, static_cloud, trajectory_of
+from .geometry.camera import Camera
+from .lens_view import LensView
+from .mapping.mapper import Mapper
+from .mapping.ply import write_gaussians_ply
+from .parts import build_parts
+from .progress import Reporter, Silent
+from .second_pass import SecondPass, second_pass
+from .slam import Slam
+from .sources import open_source
+from .types import Source, StaticCloud
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+MAPPED_SAMPLES = 24  # training views that psnr_mapped is the mean over
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run leaves behind."""
+
+    path: Path
+    metrics: dict[str, Any]
+
+
+def run(
+    source_path: str | Path,
+    out: Path,
+    config: Config,
+    *,
+    command: list[str] | None = None,
+    reporter: Reporter | None = None,
+    maps: Path | None = None,
+) -> RunResult:
+    """Do everything for one source. Raises SlamError children; what was computed until then is in the folder."""
+    want_semantic = config.semantics in ("auto", "maps")
+    source = open_source(
+        source_path,
+        config.source,
+        want_depth=config.pointmaps == "depth",
+        want_semantic=want_semantic,
+        semantic_dir=maps,
+    )
+    config = _camera_checked(config)
+    parts = build_parts(config, source)  # refuses before anything is written
+    folder = RunFolder(out, command or [])
+    job = _Job(source, config, Slam(config, parts, source.size), folder, reporter or Silent())
+    try:
+        job.everything()
+    except SlamError as e:
+        job.save_the_rest(str(e))
+        raise
+    except KeyboardInterrupt:
+        job.save_the_rest("stopped by the user (Ctrl-C)")
+        raise
+    return RunResult(folder.path, job.metrics)
+
+
+def _camera_checked(config: Config) -> Config:
+    given = config.camera.intrinsics
+    if given and len(given) not in (4, 5):
+        raise ConfigError(
+            f"--intrinsics: expected fx,fy,cx,cy or fx,fy,cx,cy,k1 in pixels, got {len(given)} numbers"
+        )
+    if given and (not np.isfinite(given).all() or min(given[:2]) <= 0):
+        raise ConfigError(f"--intrinsics: expected finite numbers with fx, fy > 0, got {given}")
+    return config
+
+
+class _Job:
+    """One run in progress."""
+
+    def __init__(
+        self, source: Source, config: Config, slam: Slam, folder: RunFolder, reporter: Reporter
+    ) -> None:
+        self.source, self.config, self.slam, self.folder, self.reporter = (
+            source,
+            config,
+            slam,
+            folder,
+            reporter,
+        )
+        self.metrics: dict[str, Any] = {}
+        self.timings: dict[str, float] = {}
+        self._started = time.perf_counter()
+        self._final: list[FinalFrame] = []
+        folder.write_config(config_to_yaml(config))
+        folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
+        folder.note(*slam.parts.notes)
+
+    def everything(self) -> None:
+        """All stages in order."""
+        with self._timed("tracking"):
+            frames = self._track()
+        with self._timed("joint optimisation"):
+            self._solve()
+        lens_view = LensView(
+            self.full_camera(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px
+        )
+        with self._timed("masks"):
+            seen = self._look_again(lens_view)
+        cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
+        self.folder.write_cloud(cloud)
+        if self.config.mapping.enabled:
+            with self._timed("map"):
+                mapper = self._map(cloud, seen)
+            with self._timed("renders"):
+                self._render(mapper, seen, lens_view)
+        self._finish(frames)
+
+    def _track(self) -> int:
+        count = 0
+        with self.reporter.stage("tracking", self.source.length, "frames") as bar:
+            for frame in self.source.frames():
+                self.slam.step(frame)
+                count += 1
+                bar.advance()
+        self.folder.note(*self.source.notes)
+        if count < 2:
+            raise InputError(f"{self.source.name}: expected at least 2 frames, got {count}")
+        if not self.slam.graph.keyframes:
+            raise InputError(
+                f"{self.source.name}: expected pictures with something in them, got {count} blank frames"
+            )
+        return count
+
+    def _solve(self) -> None:
+        finish_graph(self.slam.graph, self.config)
+        self._final = final_frames(self.slam.graph)
+        self._write_trajectory()
+
+    def _write_trajectory(self) -> None:
+        graph = self.slam.graph
+        self.folder.write_trajectory(trajectory_of(self._final))
+        self.folder.write_camera(self.full_camera())
+        report = graph.last_report
+        sigma = report.focal_sigma_ratio if report is not None else None
+        lost = [f for f in self._final if f.state == "interpolated"]
+        self.folder.update(
+            camera={
+                "focal_px": self.full_camera().fx_px,
+                "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
+                "k1": self.full_camera().k1,
+                "found": "given" if self.config.camera.intrinsics else "from the video",
+            },
+            graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
+        )
+        if lost:
+            self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
+
+    def full_camera(self) -> Camera:
+        """The lens over the full-size image."""
+        return self.slam.graph.camera().resized(*self.source.size)
+
+    def _look_again(self, lens_view: LensView) -> SecondPass:
+        with self.reporter.stage("masks", len(self._final), "frames") as bar:
+
+            def on_mask(timestamp_s: float, mask: Any) -> None:
+                self.folder.write_mask(timestamp_s, mask.probability)
+                bar.advance()
+
+            return second_pass(
+                self.source.frames(),
+                self._final,
+                self.slam.graph,
+                self.slam.parts,
+                self.config,
+                lens_view,
+                on_mask,
+            )
+
+    def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
+        mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed)
+        with self.reporter.stage("map", self.config.mapping.iterations, "steps") as bar:
+            mapper.refine(self.config.mapping.iterations, lambda _step, _loss: bar.advance())
+        write_gaussians_ply(self.folder.path / "gaussians.ply", mapper.gaussians)
+        self.metrics["gaussians"] = len(mapper.gaussians.means)
+        few = seen.views[:: max(1, len(seen.views) // MAPPED_SAMPLES)]
+        figures = []
+        for view in few:
+            color, _, _ = mapper.render(view.world_from_cam, view.camera, view.timestamp_s)
+            figures.append(psnr(color, view.image, view.static > 0.5))
+        known = [f for f in figures if f is not None and np.isfinite(f)]
+        self.metrics["psnr_mapped"] = float(np.mean(known)) if known else None
+        return mapper
+
+    def _render(self, mapper: Mapper, seen: SecondPass, lens_view: LensView) -> None:
+        with self.reporter.stage("renders", len(seen.holdout), "frames") as bar:
+            for place in seen.holdout:
+                if not np.isfinite(place.world_from_cam).all():
+                    continue
+                color, _, _ = mapper.render(place.world_from_cam, lens_view.pinhole, place.record.timestamp_s)
+                self.folder.write_render(place.record.timestamp_s, lens_view.as_photograph(color))
+                bar.advance()
+
+    def _finish(self, frames: int) -> None:
+        elapsed = time.perf_counter() - self._started
+        evaluation = evaluate(self.folder.path, self.source.truth(), self.source.frames())
+        self.metrics = {
+            **evaluation.metrics,
+            **self.metrics,
+            "keyframes": len(self.slam.graph.keyframes),
+            "focal_px": self.full_camera().fx_px,
+            "fps_tracking": frames / self.timings["tracking"],
+            "fps_total": frames / elapsed,
+            "peak_rss_mib": peak_rss_mib(),
+        }
+        self.folder.write_metrics(self.metrics)
+        self.folder.update(timings_s=self.timings)
+        self.folder.finish()
+        recorded = read_run(self.folder.path)
+        ate = evaluation.ate
+        data = gather_report_data(
+            recorded,
+            self.source.frames(),
+            {h.timestamp_s: h.psnr_db for h in evaluation.holdout},
+            ate.truth_in_map(len(recorded.trajectory.timestamps_s)) if ate and ate.rmse is not None else None,
+            ate.scale if ate and ate.rmse is not None else None,
+            title=self.source.name,
+        )
+        write_report(self.folder.path, data)
+
+    def save_the_rest(self, reason: str) -> None:
+        """Write what is known and mark the run incomplete; never hides the error that brought us here."""
+        self.folder.make_room()
+        try:
+            graph = self.slam.graph
+            if not self._final and graph.records:
+                if graph.initialised:
+                    graph.solve_all(5, 1.0)
+                self._final = final_frames(graph)
+                self._write_trajectory()
+            self.folder.note(*self.source.notes)
+            self.folder.update(timings_s=self.timings)
+            self.folder.finish("incomplete", reason)
+        except SlamError as e:
+            log.error("could not save everything: %s", e)
+
+    @contextmanager
+    def _timed(self, stage: str) -> Iterator[None]:
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.timings[stage] = time.perf_counter() - began
+
+
+def without_map(config: Config) -> Config:
+    """The same run without the Gaussian map."""
+    return replace(config, mapping=replace(config.mapping, enabled=False))

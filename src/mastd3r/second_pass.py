@@ -1,0 +1,145 @@
+"""The second look at every frame, with final poses: masks, training views for the map, colours of the cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .alignment.reproject import StaticMatches
+from .config import HOLDOUT_EVERY, Config
+from .dynamics.belief import DynamicBelief
+from .dynamics.data import DynamicMask
+from .finish import FinalFrame
+from .geometry.se3 import inverse
+from .graph.keyframe_graph import KeyframeGraph
+from .lens_view import LensView
+from .parts import Parts
+from .types import Frame, View
+from .view_depth import dynamics_input, static_at
+
+Array = NDArray[Any]
+
+
+@dataclass
+class SecondPass:
+    """What one more pass over the frames gave."""
+
+    views: list[View] = field(default_factory=list)  # for the map; no holdout frame among them
+    colors: dict[int, Array] = field(
+        default_factory=dict
+    )  # kf id -> (p, 3) uint8 at its px; no holdout frame
+    moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px
+    holdout: list[FinalFrame] = field(default_factory=list)
+
+
+def is_holdout(position: int) -> bool:
+    """Frames 0, 8, 16 … of those read are never shown to the map."""
+    return position % HOLDOUT_EVERY == 0
+
+
+def second_pass(
+    frames: Iterator[Frame],
+    final: list[FinalFrame],
+    graph: KeyframeGraph,
+    parts: Parts,
+    config: Config,
+    lens_view: LensView,
+    on_mask: Callable[[float, DynamicMask], None],
+) -> SecondPass:
+    """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``."""
+    out = SecondPass()
+    belief = DynamicBelief(config.dynamics, *parts.size)
+    chosen = _view_positions(final, config)
+    by_index = {f.record.index: f for f in final}
+    for position, frame in enumerate(frames):
+        place = by_index.get(frame.index)
+        if place is None:
+            break
+        work = parts.provider.observe(frame)
+        belief.prior(work.gray, work.semantic)
+        given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0)
+        mask = belief.update(given)
+        on_mask(frame.timestamp_s, mask)
+        if is_holdout(position):
+            out.holdout.append(place)
+            continue
+        if place.record.is_keyframe:
+            out.colors[place.record.kf_id] = _colors_at(frame.image, work.px, parts.size)
+            out.moving[place.record.kf_id] = 1 - static_at(mask.probability, work.px)
+        if position in chosen:
+            out.views.append(_view(frame, place, mask.probability, graph, parts, lens_view))
+    return out
+
+
+def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
+    """Positions of the training views: keyframes first, then evenly; never holdout, never a guessed pose."""
+    usable = [n for n, f in enumerate(final) if not is_holdout(n) and f.state in ("tracked", "started")]
+    most = config.mapping.max_views if config.mapping.enabled else 0
+    if len(usable) <= most:
+        return set(usable)
+    return {usable[int(i)] for i in np.linspace(0, len(usable) - 1, most).round()} if most else set()
+
+
+def _colors_at(image: Array, px: Array, size: tuple[int, int]) -> Array:
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    at = np.round(px).astype(int)
+    return small[at[:, 1], at[:, 0]]
+
+
+def _view(
+    frame: Frame, place: FinalFrame, moving: Array, graph: KeyframeGraph, parts: Parts, lens_view: LensView
+) -> View:
+    image, inside = lens_view.pinhole_image(frame.image)
+    p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
+    static = np.clip(1 - lens_view.pinhole_map(p), 0, 1) * inside
+    uncertainty = _uncertainty(place, graph, parts.size, lens_view)
+    return View(
+        frame.timestamp_s,
+        image,
+        static.astype(np.float32),
+        place.world_from_cam,
+        lens_view.pinhole,
+        place.record.kf_id,
+        uncertainty,
+    )
+
+
+def _uncertainty(
+    place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], lens_view: LensView
+) -> Array | None:
+    """u(p) of eq. (16) on a cell around each match whose residual is above tau_unc; None where there is none."""
+    record, block = place.record, graph.blocks[place.record.kf_id]
+    if len(record.points) == 0:
+        return None
+    keep = record.points
+    matches = StaticMatches(
+        block.px[keep],
+        block.inv_depth[keep],
+        graph.depth_info(record.kf_id)[keep],
+        record.target.astype(float),
+        record.weight.astype(float),
+        graph.lens.g,
+    )
+    new_from_ref = inverse(place.world_from_cam) @ inverse(block.cam_from_world)
+    error = np.minimum(matches.residual_px(new_from_ref), 50.0) ** 2
+    u = uncertainty_weight(error, lens_view.tau_px)
+    if not (u > 0).any():
+        return None
+    dense = np.zeros((size[1], size[0]), np.float32)
+    for (x, y), value in zip(np.round(record.target[u > 0]).astype(int), u[u > 0], strict=True):
+        cell = dense[max(0, y - 4) : y + 5, max(0, x - 4) : x + 5]
+        np.maximum(cell, np.float32(value), out=cell)
+    return lens_view.pinhole_map(dense)
+
+
+def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:
+    """Eq. (16): u = e / max e over R = {e > tau²}, 0 elsewhere; e is a squared norm, tau is in pixels."""
+    in_r = squared_error > tau_px**2
+    return (
+        np.where(in_r, squared_error / squared_error[in_r].max(), 0.0) if in_r.any() else np.zeros(len(in_r))
+    )

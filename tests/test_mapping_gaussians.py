@@ -1,0 +1,218 @@
+"""Seeding, keyframe corrections, densification rounds and the .ply file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gsply
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mastd3r.errors import InputError, OutputError
+from mastd3r.mapping.adam import RowAdam
+from mastd3r.mapping.densify import DensifyPolicy, DensifySettings
+from mastd3r.mapping.gaussians import GaussianMap, quaternion_from_rotation
+from mastd3r.mapping.ply import read_gaussians_ply, write_gaussians_ply
+from mastd3r.mapping.screen import ScreenStats
+from mastd3r.mapping.seed import seed_gaussians
+from mastd3r.types import StaticCloud
+
+K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]])
+
+
+def cloud(count: int = 300, keyframes: int = 3) -> StaticCloud:
+    rng = np.random.default_rng(0)
+    return StaticCloud(
+        points_world=rng.uniform([-1, -1, 2], [1, 1, 4], (count, 3)).astype(np.float32),
+        colors=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        confidence=np.ones(count, np.float32),
+        spacing=rng.uniform(0.02, 0.1, count).astype(np.float32),
+        kf_id=(np.arange(count) * keyframes // count).astype(np.int32),
+    )
+
+
+def random_map(count: int = 200) -> GaussianMap:
+    gaussians = seed_gaussians(cloud(count), count, 0)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        gaussians.quats += torch.randn(count, 4, generator=generator)
+        gaussians.log_scales += 0.5 * torch.randn(count, 3, generator=generator)
+        gaussians.opacity_logits += torch.randn(count, generator=generator)
+    return gaussians
+
+
+def draw(gaussians: GaussianMap, cam_from_world: np.ndarray) -> torch.Tensor:
+    with torch.no_grad():
+        return gaussians.draw(torch.from_numpy(cam_from_world), K, 64, 48, 0.05)[0]
+
+
+def motion(turn: tuple[float, float, float], shift: tuple[float, float, float]) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_rotvec(turn).as_matrix(), shift
+    return pose
+
+
+def test_seeds_carry_the_cloud() -> None:
+    source = cloud()
+    arrays = seed_gaussians(source, 1000, 0).arrays()
+    assert np.array_equal(arrays.means, source.points_world)
+    assert np.allclose(arrays.colors, source.colors / 255, atol=1e-6)
+    assert np.allclose(arrays.scales, 0.5 * source.spacing[:, None], rtol=1e-5)
+    assert np.allclose(arrays.opacities, 0.5) and np.array_equal(arrays.kf_id, source.kf_id)
+
+
+def test_thinning_is_fair_to_keyframes_and_keeps_the_covered_area() -> None:
+    source = cloud(3000, keyframes=6)
+    arrays = seed_gaussians(source, 1000, 0).arrays()
+    assert len(arrays.means) == 1000
+    assert np.ptp(np.bincount(arrays.kf_id)) <= 1
+    area = (np.square(arrays.scales[:, 0]).sum(), np.square(0.5 * source.spacing).sum())
+    assert area[0] == pytest.approx(area[1], rel=0.1)
+
+
+def test_unusable_points_are_left_out_and_none_left_is_an_error() -> None:
+    source = cloud(10)
+    source.points_world[3] = np.nan
+    source.spacing[5] = 0
+    assert len(seed_gaussians(source, 100, 0)) == 8
+    source.spacing[:] = -1
+    with pytest.raises(InputError, match="static points"):
+        seed_gaussians(source, 100, 0)
+
+
+def test_a_keyframe_correction_moves_map_and_view_together() -> None:
+    """One keyframe, moved: the image from the equally moved camera stays the same."""
+    gaussians = random_map()
+    gaussians.kf_id[:] = 7
+    old, new = motion((0.1, 0, 0.2), (0.5, 0, 0)), motion((-0.3, 0.5, 0.1), (0.1, 2, -1))
+    moved = gaussians.moved({7: old}, {7: new})
+    world_from_cam = motion((0, 0.05, 0), (0.02, 0, 0))
+    before = draw(gaussians, np.linalg.inv(world_from_cam))
+    after = draw(moved, np.linalg.inv(new @ np.linalg.inv(old) @ world_from_cam))
+    assert float(before.std()) > 0.05
+    assert (before - after).abs().max() < 1e-4
+
+
+def test_only_the_corrected_keyframes_gaussians_move() -> None:
+    gaussians = random_map()
+    identity = {0: np.eye(4), 1: np.eye(4), 2: np.eye(4)}
+    moved = gaussians.moved(identity, {**identity, 1: motion((0, 0, 0), (0.05, 0, 0))})
+    change = (moved.means - gaussians.means).detach().norm(dim=1)
+    assert torch.allclose(change[gaussians.kf_id == 1], torch.tensor(0.05), atol=1e-6)
+    assert torch.all(change[gaussians.kf_id != 1] == 0)
+
+
+def test_a_correction_with_scale_scales_the_gaussians() -> None:
+    gaussians = random_map()
+    gaussians.kf_id[:] = 0
+    scaled = np.diag([1.7, 1.7, 1.7, 1.0])
+    moved = gaussians.moved({0: np.eye(4)}, {0: scaled})
+    assert torch.allclose(moved.means, 1.7 * gaussians.means, atol=1e-5)
+    assert torch.allclose(moved.log_scales.exp(), 1.7 * gaussians.log_scales.exp(), rtol=1e-4)
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0), (3.14159, 0, 0), (0, 2.2, 2.2), (1e-9, 0, 0), (0.3, -0.2, 1)])
+def test_quaternion_of_a_rotation(turn: tuple[float, float, float]) -> None:
+    matrix = Rotation.from_rotvec(turn).as_matrix()
+    w, x, y, z = quaternion_from_rotation(matrix)
+    assert np.allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), matrix, atol=1e-9)
+
+
+def observed(gaussians: GaussianMap, grad: torch.Tensor, radius: int, **settings: float) -> DensifyPolicy:
+    policy = DensifyPolicy(260, 1000, 0, DensifySettings(**settings))  # type: ignore[arg-type]
+    size = torch.full((len(gaussians), 2), radius, dtype=torch.int32)
+    policy.observe(gaussians, ScreenStats(size, torch.stack([grad, torch.zeros_like(grad)], 1)), 64)
+    return policy
+
+
+def test_growth_takes_the_largest_gradients_and_respects_the_limit() -> None:
+    gaussians = random_map(200)
+    grad = torch.linspace(0, 1, 200)
+    policy = observed(gaussians, grad, radius=3)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    assert len(after) == 260
+    assert torch.equal(after.means[200:].detach().sort(0)[0], gaussians.means[140:].detach().sort(0)[0])
+    assert torch.equal(after.kf_id[200:].sort()[0], gaussians.kf_id[140:].sort()[0])
+
+
+def test_clones_hide_as_much_as_their_parent() -> None:
+    gaussians = random_map(5)
+    policy = observed(gaussians, torch.tensor([0.0, 0, 9, 0, 0]), radius=3)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    parent, child = after.opacity_logits[[2, 5]].detach().sigmoid()
+    assert float(1 - (1 - parent) * (1 - child)) == pytest.approx(
+        float(gaussians.opacity_logits[2].detach().sigmoid()), abs=1e-5
+    )
+
+
+def test_large_gaussians_are_split_and_shrink() -> None:
+    gaussians = random_map(5)
+    policy = observed(gaussians, torch.tensor([0.0, 0, 9, 0, 0]), radius=15)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    assert len(after) == 6
+    for row in (2, 5):
+        assert torch.all(after.log_scales[row] < gaussians.log_scales[2])
+        assert not torch.equal(after.means[row], gaussians.means[2])
+    assert not torch.equal(after.means[2], after.means[5])
+
+
+def test_transparent_and_veiling_gaussians_are_pruned() -> None:
+    gaussians = random_map(50)
+    with torch.no_grad():
+        gaussians.opacity_logits[:10] = -6
+    policy = observed(gaussians, torch.zeros(50), radius=3)
+    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) == 40
+    policy = observed(gaussians, torch.zeros(50), radius=200)
+    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) >= 1  # never an empty map
+
+
+def test_adam_is_torchs_adam_and_follows_rows() -> None:
+    start = torch.randn(6, 3, generator=torch.Generator().manual_seed(0))
+    ours, theirs = start.clone().requires_grad_(), start.clone().requires_grad_()
+    adam, reference = RowAdam({"p": ours}), torch.optim.Adam([theirs], lr=0.02, eps=1e-15)
+    for _ in range(5):
+        for p in (ours, theirs):
+            p.grad = None
+            (p.sin() * torch.arange(18).view(6, 3)).sum().backward()
+        adam.step({"p": ours}, {"p": 0.02})
+        reference.step()
+    assert torch.allclose(ours, theirs, atol=1e-6)
+    adam.pick(torch.tensor([4, 4, 0]), torch.tensor([False, True, False]))
+    moments = adam._first["p"]
+    assert moments.shape == (3, 3) and torch.all(moments[1] == 0) and torch.any(moments[0] != 0)
+
+
+def test_ply_round_trip_and_an_independent_reader(tmp_path: Path) -> None:
+    arrays = random_map().arrays()
+    path = tmp_path / "gaussians.ply"
+    write_gaussians_ply(path, arrays)
+    back = read_gaussians_ply(path)
+    for name in ("means", "scales", "quats", "opacities", "colors"):
+        assert np.allclose(getattr(back, name), getattr(arrays, name), atol=1e-5), name
+    other = gsply.plyread(str(path))
+    assert np.allclose(other.means, arrays.means)
+    assert np.allclose(np.exp(other.scales), arrays.scales, rtol=1e-5)
+    assert np.allclose(other.quats, arrays.quats, atol=1e-6)
+    assert np.allclose(1 / (1 + np.exp(-np.ravel(other.opacities))), arrays.opacities, atol=1e-6)
+    assert np.allclose(other.sh0 * 0.28209479177387814 + 0.5, arrays.colors, atol=1e-6)
+
+
+def test_ply_on_a_full_disk_and_bad_files(tmp_path: Path) -> None:
+    full = Path("/dev/full")
+    if full.exists():
+        with pytest.raises(OutputError, match="expected to write"):
+            write_gaussians_ply(full, random_map(2000).arrays())
+    with pytest.raises(OutputError):
+        write_gaussians_ply(tmp_path / "missing" / "a.ply", random_map(5).arrays())
+    with pytest.raises(InputError, match="readable"):
+        read_gaussians_ply(tmp_path / "none.ply")
+    (tmp_path / "bad.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match="layout"):
+        read_gaussians_ply(tmp_path / "bad.ply")
+    write_gaussians_ply(tmp_path / "cut.ply", random_map(5).arrays())
+    data = (tmp_path / "cut.ply").read_bytes()
+    (tmp_path / "cut.ply").write_bytes(data[:-7])
+    with pytest.raises(InputError, match="expected 5 Gaussians"):
+        read_gaussians_ply(tmp_path / "cut.ply")

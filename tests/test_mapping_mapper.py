@@ -1,0 +1,181 @@
+"""The mapper on a synthetic world of Gaussians whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mastd3r.config import MapLossKind, MappingConfig
+from mastd3r.errors import InputError
+from mastd3r.geometry.camera import Camera
+from mastd3r.mapping.gaussians import GaussianMap
+from mastd3r.mapping.mapper import Mapper
+from mastd3r.mapping.seed import seed_gaussians
+from mastd3r.types import StaticCloud, View
+
+CAMERA = Camera.centred(80.0, 96, 72)
+STEPS = 160
+
+
+def wall(count: int, noise: float) -> StaticCloud:
+    """Points of a wavy, textured wall 3 units away; texture is a function of the place."""
+    rng = np.random.default_rng(0)
+    x, y = rng.uniform(-2.4, 2.4, count), rng.uniform(-1.9, 1.9, count)
+    z = 3 + 0.3 * np.sin(2 * x) + noise * rng.standard_normal(count)
+    rgb = np.stack([0.5 + 0.4 * np.sin(5 * x), 0.5 + 0.4 * np.cos(4 * y), 0.5 + 0.4 * np.sin(3 * (x + y))], 1)
+    return StaticCloud(
+        points_world=np.stack([x, y, z], 1).astype(np.float32),
+        colors=(rgb * 255).astype(np.uint8),
+        confidence=np.ones(count, np.float32),
+        spacing=np.full(count, np.sqrt(4.8 * 3.8 / count), np.float32),
+        kf_id=(np.arange(count) % 3).astype(np.int32),
+    )
+
+
+def pose(i: int) -> np.ndarray:
+    world_from_cam = np.eye(4)
+    world_from_cam[:3, 3] = [0.35 * np.cos(0.7 * i), 0.25 * np.sin(0.9 * i), 0.1 * np.sin(i)]
+    return world_from_cam
+
+
+def photograph(truth: GaussianMap, world_from_cam: np.ndarray) -> np.ndarray:
+    with torch.no_grad():
+        cam_from_world = torch.from_numpy(np.linalg.inv(world_from_cam))
+        K = torch.from_numpy(CAMERA.matrix)
+        return truth.draw(cam_from_world, K, CAMERA.width, CAMERA.height, 0.1)[0].clamp(0, 1).numpy()
+
+
+@pytest.fixture(scope="module")
+def truth() -> GaussianMap:
+    gaussians = seed_gaussians(wall(6000, 0.0), 6000, 0)
+    with torch.no_grad():
+        gaussians.opacity_logits += 3
+    return gaussians
+
+
+def view(truth: GaussianMap, i: int, gain: float = 1.0, ghost: bool = False) -> View:
+    """Photograph number i; with ``ghost`` a white block stands in most frames in one place of the world."""
+    image, static = photograph(truth, pose(i)) * np.float32(gain), np.ones((72, 96), np.float32)
+    if ghost and i % 4 != 0:
+        centre = CAMERA.project((np.array([0.1, 0, 2.0]) - pose(i)[:3, 3])[None])[0].round().astype(int)
+        block = (slice(centre[1] - 10, centre[1] + 10), slice(centre[0] - 8, centre[0] + 8))
+        image[block], static[block] = 1.0, 0.03
+    return View(float(i), np.clip(image, 0, 1), static, pose(i), CAMERA, i % 3)
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(-10 * np.log10(np.square(a - b).mean()))
+
+
+def trained(views: list[View], loss: MapLossKind = "full", steps: int = STEPS, **options: object) -> Mapper:
+    config = MappingConfig(iterations=steps, max_gaussians=3000, loss=loss, **options)  # type: ignore[arg-type]
+    mapper = Mapper(config, wall(1500, 0.03), views, seed=0)
+    mapper.refine(steps)
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def mapper(truth: GaussianMap) -> Mapper:
+    return trained([view(truth, i) for i in range(12)])
+
+
+def holdout_psnr(mapper: Mapper, truth: GaussianMap) -> float:
+    return psnr(mapper.render(pose(100), CAMERA)[0], photograph(truth, pose(100)))
+
+
+def test_training_improves_an_unseen_view_and_grows_within_bounds(truth: GaussianMap, mapper: Mapper) -> None:
+    start = holdout_psnr(trained([view(truth, 0)], steps=0), truth)
+    assert holdout_psnr(mapper, truth) > max(start + 4, 24)
+    assert 900 < len(mapper.gaussians.means) <= 3000
+
+
+def test_depth_is_in_map_units(mapper: Mapper) -> None:
+    _, depth, alpha = mapper.render(pose(100), CAMERA)
+    middle = depth[20:52, 30:66][alpha[20:52, 30:66] > 0.9]
+    x = (np.arange(30, 66) - CAMERA.cx_px) / CAMERA.fx_px * 3 + pose(100)[0, 3]
+    assert np.median(middle) == pytest.approx(3 + np.mean(0.3 * np.sin(2 * x)) - pose(100)[2, 3], abs=0.12)
+
+
+def test_same_seed_same_map(truth: GaussianMap) -> None:
+    views = [view(truth, i) for i in range(4)]
+    a, b = trained(views, steps=60).gaussians, trained(views, steps=60).gaussians
+    assert np.array_equal(a.means, b.means) and np.array_equal(a.colors, b.colors)
+
+
+def test_a_moving_thing_leaves_no_ghost_under_the_mask_and_does_without(truth: GaussianMap) -> None:
+    """Compared where the white block stood, from a frame in which it is absent."""
+    views = [view(truth, i, ghost=True) for i in range(12)]
+    block = (slice(26, 46), slice(40, 60))
+    clean = photograph(truth, pose(0))[block]
+    masked, plain = (
+        psnr(trained(views, loss).render(pose(0), CAMERA)[0][block], clean) for loss in ("mask", "plain")
+    )
+    assert masked > 18 and masked > plain + 5
+
+
+def test_exposure_of_a_view_is_learned_and_interpolated(truth: GaussianMap) -> None:
+    views = [view(truth, i, gain=0.8 if i < 6 else 1.0) for i in range(12)]
+    mapper = trained(views, steps=240)
+    dark, light = (mapper.render(pose(100), CAMERA, timestamp_s=t)[0].mean() for t in (2.0, 9.0))
+    assert 0.75 < dark / light < 0.9
+    between = mapper.render(pose(100), CAMERA, timestamp_s=5.5)[0].mean()
+    assert dark < between < light
+
+
+def test_pose_refinement_pulls_wrong_cameras_back(truth: GaussianMap) -> None:
+    """In pixels of the wall's points: shift and turn can stand in for one another on a distant wall."""
+    views = [view(truth, i) for i in range(8)]
+    wrong = pose(3)
+    wrong[:3, 3] += [0.08, 0, 0]
+    views[3] = View(3.0, views[3].image, views[3].static, wrong, CAMERA, 0)
+    mapper = trained(views, steps=300, refine_poses=True)
+    points = wall(200, 0.0).points_world.astype(float)
+
+    def error_px(cam_from_world: np.ndarray) -> float:
+        pixels = [
+            CAMERA.project(points @ t[:3, :3].T + t[:3, 3]) for t in (cam_from_world, np.linalg.inv(pose(3)))
+        ]
+        return float(np.linalg.norm(pixels[0] - pixels[1], axis=1).mean())
+
+    assert error_px(np.linalg.inv(wrong)) > 1.5
+    assert error_px(mapper._view_parameters.cam_from_world(3).detach().numpy()) < 0.5
+
+
+def test_a_graph_correction_keeps_the_picture(truth: GaussianMap) -> None:
+    """All keyframes shift by 5 cm, as after a loop closure: the equally shifted camera sees the same."""
+    mapper = trained([view(truth, i) for i in range(6)], steps=60)
+    before = mapper.render(pose(100), CAMERA)[0]
+    shift = np.eye(4)
+    shift[:3, 3] = [0.05, 0, 0]
+    old = {k: np.eye(4) for k in range(3)}
+    mapper.move_keyframes(old, dict.fromkeys(range(3), shift))
+    assert np.abs(mapper.render(shift @ pose(100), CAMERA)[0] - before).max() < 1e-3
+    losses: list[float] = []
+    mapper.refine(6, lambda _, loss: losses.append(loss))
+    assert len(losses) == 6 and max(losses) < 0.2
+
+
+def test_paper_loss_trains_too(truth: GaussianMap) -> None:
+    mapper = trained([view(truth, i) for i in range(12)], paper_loss=True, hard_weight=True)
+    assert holdout_psnr(mapper, truth) > 22
+
+
+def test_pixels_without_data_do_not_count(truth: GaussianMap) -> None:
+    views = [view(truth, i) for i in range(6)]
+    for v in views:
+        v.image[:, :20], v.static[:, :20] = 0, 0
+    mapper = trained(views, loss="plain", steps=60)
+    assert mapper.render(pose(0), CAMERA)[0][:, :20].mean() > 0.3
+
+
+def test_bad_views_are_refused(truth: GaussianMap) -> None:
+    with pytest.raises(InputError, match="at least one"):
+        trained([])
+    good = view(truth, 0)
+    with pytest.raises(InputError, match="expected image"):
+        trained([View(0.0, good.image[1:], good.static, good.world_from_cam, CAMERA, 0)])
+    away = pose(0)
+    away[:3, :3] = np.diag([-1, 1, -1])
+    with pytest.raises(InputError, match="in front"):
+        trained([View(0.0, good.image, good.static, away, CAMERA, 0)])
