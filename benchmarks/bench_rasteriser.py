@@ -46,9 +46,7 @@ def random_case(count: int, width: int, height: int) -> list[torch.Tensor]:
         view,
     ]
     leaves = [torch.tensor(a, dtype=torch.float32).requires_grad_() for a in arrays]
-    K = torch.tensor(
-        [[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]], dtype=torch.float32
-    )
+    K = torch.tensor([[focal, 0, width / 2 - 0.5], [0, focal, height / 2 - 0.5], [0, 0, 1]], dtype=torch.float32)
     return [*leaves, K]
 
 
@@ -71,9 +69,7 @@ def torch_rasterise(means, quats, scales, opacities, colors, view, K, width, hei
     features = torch.cat([colors, z[:, None]], -1)
     columns, rows = -(-width // tile), -(-height // tile)
     with torch.no_grad():
-        reach = (
-            torch.sqrt(2 * torch.log(opacities * 255)).clamp(min=0)[:, None] * torch.stack([a, c], -1).sqrt()
-        )
+        reach = torch.sqrt(2 * torch.log(opacities * 255)).clamp(min=0)[:, None] * torch.stack([a, c], -1).sqrt()
         limit = torch.tensor([columns, rows])
         low = ((pixels - reach) / tile).floor().long().clamp(min=0)
         high = torch.minimum(((pixels + reach) / tile).ceil().long(), limit)
@@ -89,10 +85,7 @@ def torch_rasterise(means, quats, scales, opacities, colors, view, K, width, hei
         counts = torch.bincount(tiles, minlength=columns * rows)
         starts = counts.cumsum(0) - counts
     image = torch.zeros(columns * rows, tile * tile, 5)
-    grid = (
-        torch.stack(torch.meshgrid(torch.arange(tile), torch.arange(tile), indexing="xy"), -1).view(-1, 2)
-        + 0.5
-    )
+    grid = torch.stack(torch.meshgrid(torch.arange(tile), torch.arange(tile), indexing="xy"), -1).view(-1, 2) + 0.5
     level = torch.ceil(torch.log2(counts.clamp(min=1).float())).long()
     for power in level.unique().tolist():
         chosen = torch.nonzero((level == power) & (counts > 0))[:, 0]
@@ -112,11 +105,7 @@ def torch_rasterise(means, quats, scales, opacities, colors, view, K, width, hei
             weight = alpha * before
             part = torch.cat([weight @ features[ids], weight.sum(-1, keepdim=True)], -1)
             image = image.index_put((group,), part)
-    full = (
-        image.view(rows, columns, tile, tile, 5)
-        .permute(0, 2, 1, 3, 4)
-        .reshape(rows * tile, columns * tile, 5)
-    )
+    full = image.view(rows, columns, tile, tile, 5).permute(0, 2, 1, 3, 4).reshape(rows * tile, columns * tile, 5)
     full = full[:height, :width]
     return full[..., :3], full[..., 3], full[..., 4]
 
@@ -158,9 +147,7 @@ def measure(count: int, width: int, height: int, repeats: int, with_torch: bool)
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("bench_rasteriser.json"))
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--no-torch", action="store_true", help="time only our own rasteriser")

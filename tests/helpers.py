@@ -68,9 +68,7 @@ def write_video(
 def patch_display_matrix(path: Path, matrix: Sequence[int]) -> None:
     """Overwrite the linear part (a, b, c, d) of an mp4's display matrix: x' = a x + c y, y' = b x + d y."""
     data = bytearray(path.read_bytes())
-    at = (
-        data.index(b"tkhd") + 4 + 4 + 20 + 8 + 8
-    )  # version and flags, times and ids, reserved, layer … volume
+    at = data.index(b"tkhd") + 4 + 4 + 20 + 8 + 8  # version and flags, times and ids, reserved, layer … volume
     a, b, c, d = (v << 16 for v in matrix)
     data[at : at + 36] = np.array([a, b, 0, c, d, 0, 0, 0, 1 << 30], ">i4").tobytes()
     path.write_bytes(data)

@@ -123,9 +123,7 @@ def test_without_truth_only_what_can_be_known(run: RunFolder, sequence: Sequence
     }  # fmt: skip
 
 
-def test_truth_without_masks_does_not_call_anything_a_false_positive(
-    run: RunFolder, sequence: Sequence
-) -> None:
+def test_truth_without_masks_does_not_call_anything_a_false_positive(run: RunFolder, sequence: Sequence) -> None:
     truth = Truth(sequence.truth.timestamps_s, sequence.truth.world_from_cam)
     metrics = evaluate_run(run.path, truth, sequence.frames())
     assert "mask_iou" not in metrics

@@ -50,10 +50,7 @@ def evo_figures(estimate: np.ndarray, truth: np.ndarray, times_s: np.ndarray) ->
     out = {}
     ape = metrics.APE(metrics.PoseRelation.translation_part)
     ape.process_data((ref, est))
-    out |= {
-        key: float(ape.get_statistic(metrics.StatisticsType[key]))
-        for key in ("rmse", "mean", "median", "max")
-    }
+    out |= {key: float(ape.get_statistic(metrics.StatisticsType[key])) for key in ("rmse", "mean", "median", "max")}
     relations = metrics.PoseRelation
     for delta in (1, 5):
         for name, kind in (

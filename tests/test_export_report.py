@@ -123,10 +123,7 @@ def test_the_page_of_a_run(run_path: Path) -> None:
     ):
         assert words in text
     assert "mastd3r run 'it'\"'\"'s <me>.mp4'" in text
-    order = [
-        page.index(h)
-        for h in ("Photograph, splat", "What moves", "<h2>Trajectory", "<h2>Figures", "<h2>Time")
-    ]
+    order = [page.index(h) for h in ("Photograph, splat", "What moves", "<h2>Trajectory", "<h2>Figures", "<h2>Time")]
     assert order == sorted(order)
 
 
@@ -241,10 +238,7 @@ def test_figures_read_well() -> None:
     assert shown("mask_false_positive_ratio", 0.0123) == "1.23%"
     assert shown("mask_iou", None) == "–"
     assert described("ate_rmse_all_note").startswith("Why no ATE")
-    assert (
-        summary_line({"frames": 3, "frames_posed": 2, "fps_total": 1.5})
-        == "2 of 3 frames posed · 1.50 frames/s"
-    )
+    assert summary_line({"frames": 3, "frames_posed": 2, "fps_total": 1.5}) == "2 of 3 frames posed · 1.50 frames/s"
     given = {"odd": 1, "gaussians": 2, "ate_rmse_all": None, "ate_rmse_all_note": "still", "frames": 3}
     assert [k for k, _ in in_order(given)] == [
         "frames",

@@ -15,9 +15,7 @@ from mastd3r.geometry.camera import Camera
 from mastd3r.mapping.mapper import Mapper
 from mastd3r.types import StaticCloud, View
 
-DATA = (
-    Path(os.environ.get("MASTD3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "kitchen"
-)
+DATA = Path(os.environ.get("MASTD3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")) / "kitchen"
 FULL = Camera(519.0, 519.0, 319.5, 239.5, 640, 480)
 SMALL = FULL.resized(160, 120)
 
@@ -43,9 +41,7 @@ def undistorted(name: str, flag: int) -> np.ndarray:
 
 def photograph(name: str) -> np.ndarray:
     image = cv2.cvtColor(undistorted(name, cv2.INTER_LINEAR), cv2.COLOR_BGR2RGB)
-    return (
-        cv2.resize(image, (SMALL.width, SMALL.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-    )
+    return cv2.resize(image, (SMALL.width, SMALL.height), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
 
 
 def seeds(frames: list[int], world_from_cam: np.ndarray, colors: dict[int, np.ndarray]) -> StaticCloud:
@@ -62,9 +58,7 @@ def seeds(frames: list[int], world_from_cam: np.ndarray, colors: dict[int, np.nd
         ids.append(np.full(int(good.sum()), i))
     xyz, spread = np.concatenate(points).astype(np.float32), np.concatenate(spacing).astype(np.float32)
     color = (np.concatenate(rgb) * 255).astype(np.uint8)
-    return StaticCloud(
-        xyz, color, np.ones(len(xyz), np.float32), spread, np.concatenate(ids).astype(np.int32)
-    )
+    return StaticCloud(xyz, color, np.ones(len(xyz), np.float32), spread, np.concatenate(ids).astype(np.int32))
 
 
 def test_unseen_frames_of_a_real_room_are_drawn_well() -> None:

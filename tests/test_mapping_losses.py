@@ -47,11 +47,7 @@ def test_16_uncertainty_is_the_squared_residual_over_its_maximum_beyond_tau() ->
 def test_17_total(kind: str, paper: bool) -> None:
     u = torch.tensor([[0.0, 0.4, 1.0, 1.0]])
     error = torch.tensor([[1.0, 2.0, 3.0, 4.0]])
-    w = (
-        static_weight(STATIC, 0.05, hard=False)
-        if kind in ("mask", "full")
-        else torch.tensor([[1.0, 1, 1, 0]])
-    )
+    w = static_weight(STATIC, 0.05, hard=False) if kind in ("mask", "full") else torch.tensor([[1.0, 1, 1, 0]])
     total = pixel_weight(kind, STATIC, u, 0.05, False, 0.1, paper)  # type: ignore[arg-type]
     if kind in ("plain", "mask"):
         assert torch.equal(total, w)

@@ -108,9 +108,7 @@ def test_a_moving_thing_leaves_no_ghost_under_the_mask_and_does_without(truth: G
     views = [view(truth, i, ghost=True) for i in range(12)]
     block = (slice(26, 46), slice(40, 60))
     clean = photograph(truth, pose(0))[block]
-    masked, plain = (
-        psnr(trained(views, loss).render(pose(0), CAMERA)[0][block], clean) for loss in ("mask", "plain")
-    )
+    masked, plain = (psnr(trained(views, loss).render(pose(0), CAMERA)[0][block], clean) for loss in ("mask", "plain"))
     assert masked > 18 and masked > plain + 5
 
 
@@ -133,9 +131,7 @@ def test_pose_refinement_pulls_wrong_cameras_back(truth: GaussianMap) -> None:
     points = wall(200, 0.0).points_world.astype(float)
 
     def error_px(cam_from_world: np.ndarray) -> float:
-        pixels = [
-            CAMERA.project(points @ t[:3, :3].T + t[:3, 3]) for t in (cam_from_world, np.linalg.inv(pose(3)))
-        ]
+        pixels = [CAMERA.project(points @ t[:3, :3].T + t[:3, 3]) for t in (cam_from_world, np.linalg.inv(pose(3)))]
         return float(np.linalg.norm(pixels[0] - pixels[1], axis=1).mean())
 
     assert error_px(np.linalg.inv(wrong)) > 1.5

@@ -65,14 +65,10 @@ def random_scene(kind: str, seed: int, count: int = 120) -> tuple[Scene, torch.T
 def weighted_loss(result: tuple[torch.Tensor, ...], seed: int = 5) -> torch.Tensor:
     """A fixed random linear function of colour, depth and alpha."""
     generator = torch.Generator().manual_seed(seed)
-    return sum(
-        (r.double() * torch.rand(r.shape, generator=generator, dtype=torch.float64)).sum() for r in result
-    )
+    return sum((r.double() * torch.rand(r.shape, generator=generator, dtype=torch.float64)).sum() for r in result)
 
 
-def with_grads(
-    function: Any, scene: Scene, K: torch.Tensor, **options: Any
-) -> tuple[Any, list[torch.Tensor]]:
+def with_grads(function: Any, scene: Scene, K: torch.Tensor, **options: Any) -> tuple[Any, list[torch.Tensor]]:
     leaves = [scene[n].clone().requires_grad_() for n in NAMES]
     result = function(*leaves, K, WIDTH, HEIGHT, **options)
     return result, list(torch.autograd.grad(weighted_loss(result), leaves))
@@ -107,9 +103,7 @@ def test_reference_gradients_match_finite_differences() -> None:
             for step in (1e-6, -1e-6):
                 moved = {k: v.clone() for k, v in scene.items()}
                 moved[name].view(-1)[int(at)] += step
-                values.append(
-                    weighted_loss(rasterise_reference(*(moved[n] for n in NAMES), K, WIDTH, HEIGHT))
-                )
+                values.append(weighted_loss(rasterise_reference(*(moved[n] for n in NAMES), K, WIDTH, HEIGHT)))
             difference = float(values[0] - values[1]) / 2e-6
             errors.append(abs(difference - float(grad.reshape(-1)[int(at)])) / float(grad.abs().max()))
         assert np.quantile(errors, 0.7) < 1e-6, name
@@ -141,9 +135,7 @@ def test_background_shows_where_nothing_is() -> None:
 
 def test_no_gaussian_gives_the_background() -> None:
     empty = [torch.zeros(0, 3), torch.zeros(0, 4), torch.zeros(0, 3), torch.zeros(0), torch.zeros(0, 3)]
-    color, depth, alpha = rasterization(
-        *empty, torch.eye(4), torch.eye(3), 20, 9, background=torch.full((3,), 0.25)
-    )
+    color, depth, alpha = rasterization(*empty, torch.eye(4), torch.eye(3), 20, 9, background=torch.full((3,), 0.25))
     assert torch.all(color == 0.25) and torch.all(depth == 0) and torch.all(alpha == 0)
 
 

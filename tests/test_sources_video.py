@@ -126,9 +126,7 @@ def test_odd_sizes(tmp_path: Path) -> None:
 
 
 def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
-    path = write_video(
-        tmp_path / "wide.mp4", blobs(3), codec_options={"x264-params": "sar=4/3"}, pix_fmt="yuv420p"
-    )
+    path = write_video(tmp_path / "wide.mp4", blobs(3), codec_options={"x264-params": "sar=4/3"}, pix_fmt="yuv420p")
     source = open_source(path, ALL)
     assert source.size == (85, 48)
     assert next(source.frames()).image.shape == (48, 85, 3)

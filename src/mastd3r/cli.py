@@ -11,6 +11,7 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; 0 = done, 2 = something that the user can mend (one line says what), 130 = Ctrl-C."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads must not eat the cores
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the solvers' matrices are small: threads only wait
     from .cli_commands import dispatch
     from .errors import SlamError

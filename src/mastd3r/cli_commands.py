@@ -39,16 +39,12 @@ def dispatch(words: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="mastd3r", description="Trajectory, static map and clean splat from a video."
-    )
+    parser = argparse.ArgumentParser(prog="mastd3r", description="Trajectory, static map and clean splat from a video.")
     parser.add_argument("--version", action="version", version=__version__)
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(commands.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
-    demo = commands.add_parser(
-        "demo", help="make a small clip with a moving object and run the whole job on it"
-    )
+    demo = commands.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
     demo.set_defaults(act=_demo)
@@ -73,14 +69,10 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("source", type=Path, help="video, folder of images, or TUM-layout folder")
     p.add_argument("--out", type=Path, required=True, help="run folder")
     p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
-    p.add_argument(
-        "--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml"
-    )
+    p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=("auto", "geometric", "mast3r", "depth"))
     p.add_argument("--semantics", choices=("auto", "none", "dinov2", "maps"))
-    p.add_argument(
-        "--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp"
-    )
+    p.add_argument("--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=("none", "coarse", "fine", "coarse-to-fine"))
     p.add_argument("--map-loss", choices=("plain", "mask", "uncertainty", "full"))
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
@@ -139,9 +131,7 @@ def _run_and_show(
     from .progress import Silent, Terminal
     from .run import run
 
-    result = run(
-        source, out, config, command=words, reporter=Silent() if quiet else Terminal(console), maps=maps
-    )
+    result = run(source, out, config, command=words, reporter=Silent() if quiet else Terminal(console), maps=maps)
     Console().print(_table(result.metrics))
     Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]")
     return 0
@@ -166,9 +156,7 @@ def _demo(args: argparse.Namespace, console: Console) -> int:
         with console.status("making the clip: a furnished room with a moving ball"):
             make_room_clip(clip, frames=args.frames, seed=DEMO_SEED)
         code = _run_and_show(clip, args.out, Config(), args.words, console)
-        shutil.copy(
-            clip / "rgb" / sorted(p.name for p in (clip / "rgb").iterdir())[0], args.out / "first_frame.png"
-        )
+        shutil.copy(clip / "rgb" / sorted(p.name for p in (clip / "rgb").iterdir())[0], args.out / "first_frame.png")
     return code
 
 

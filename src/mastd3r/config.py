@@ -45,9 +45,7 @@ class TrackingConfig:
     area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
     cell_px: int = 10  # one matched pixel a cell of this size
     keyframe_motion_ratio: float = 0.08  # median image motion since the keyframe, share of the image width
-    keyframe_overlap_ratio: float = (
-        0.55  # matched share of the keyframe's own matchable pixels, below: new keyframe
-    )
+    keyframe_overlap_ratio: float = 0.55  # matched share of the keyframe's own matchable pixels, below: new keyframe
     min_inlier_ratio: float = 0.35  # below: the pose is not believed
     max_frames_between: int = 60  # a keyframe at least this often while the camera moves
 
@@ -71,9 +69,7 @@ class GraphConfig:
     window_iterations: int = 4
     final_iterations: int = 40
     kernel_px: float = 0.5  # Cauchy scale of the final optimisation
-    loop_overlap_ratio: float = (
-        0.5  # predicted share of points in view that makes an old keyframe a candidate
-    )
+    loop_overlap_ratio: float = 0.5  # predicted share of points in view that makes an old keyframe a candidate
     min_match_ratio: float = 0.15  # edges with a smaller matched share are dropped
 
 
@@ -159,9 +155,7 @@ def _build(cls: type, data: dict[str, Any], where: str) -> Any:
 
 def _merge(obj: Any, data: Any, where: str) -> Any:
     if not isinstance(data, dict):
-        raise ConfigError(
-            f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {data!r}"
-        )
+        raise ConfigError(f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {data!r}")
     hints = typing.get_type_hints(type(obj))
     names = [f.name for f in fields(obj)]
     changes: dict[str, Any] = {}
@@ -183,9 +177,7 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
     if origin is Literal:
         options = typing.get_args(hint)
         if value not in options:
-            raise ConfigError(
-                f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}"
-            )
+            raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
         return value
     if origin in (typing.Union, types.UnionType):
         if value is None:

@@ -33,13 +33,12 @@ class FinalFrame:
 
 def finish_graph(graph: KeyframeGraph, config: Config) -> None:
     """Start what never started, then optimise everything. Raises InputError for a camera that never moves."""
-    if not graph.initialised:
-        if len(graph.keyframes) < 2 or not bootstrap(graph):
-            raise InputError(
-                f"the camera never moves enough: expected image motion of at least "
-                f"{config.tracking.keyframe_motion_ratio:.0%} of the width with parallax, got "
-                f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
-            )
+    if not graph.initialised and (len(graph.keyframes) < 2 or not bootstrap(graph)):
+        raise InputError(
+            f"the camera never moves enough: expected image motion of at least "
+            f"{config.tracking.keyframe_motion_ratio:.0%} of the width with parallax, got "
+            f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
+        )
     graph.solve_all(config.graph.final_iterations // 2, 1.0)
     report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
     log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),

@@ -28,10 +28,8 @@ class LensView:
         rays = self.pinhole.rays(grid)
         self._from_photo = self.camera.project(rays).astype(np.float32)
         inside = (self._from_photo >= -0.5) & (self._from_photo <= np.array([width - 0.5, height - 0.5]))
-        self._inside = inside.all(-1).astype(np.float32)
-        self._from_pinhole = self.pinhole.project(self.camera.rays(self.camera.pixel_grid())).astype(
-            np.float32
-        )
+        self._inside: Array = np.asarray(inside.all(-1), np.float32)
+        self._from_pinhole = self.pinhole.project(self.camera.rays(self.camera.pixel_grid())).astype(np.float32)
 
     def pinhole_image(self, image: Array) -> tuple[Array, Array]:
         """(h, w, 3) float32 0..1 pinhole image of a full-size uint8 photograph, and (h, w) 1 where it has data."""

@@ -48,9 +48,7 @@ def build_parts(config: Config, source: Source) -> Parts:
             "--pointmaps mast3r: expected MASt3R weights, which this version cannot load yet; use geometric or depth"
         )
     if kind == "depth" and not source.has_depth:
-        raise InputError(
-            f"--pointmaps depth: expected a TUM-layout folder with depth.txt, {source.name} has no depth"
-        )
+        raise InputError(f"--pointmaps depth: expected a TUM-layout folder with depth.txt, {source.name} has no depth")
     provider_class = SensorDepthPointmaps if kind == "depth" else GeometricPointmaps
     provider = provider_class(width, height, config.tracking.cell_px)
     notes.append(_semantics_note(config, source))
@@ -63,12 +61,8 @@ def _semantics_note(config: Config, source: Source) -> str:
             "--semantics dinov2: expected DINOv2 weights, which this version cannot load yet; use maps or none"
         )
     if config.semantics == "maps" and not source.has_semantic:
-        raise InputError(
-            f"--semantics maps: expected probability maps beside the frames, {source.name} has none"
-        )
+        raise InputError(f"--semantics maps: expected probability maps beside the frames, {source.name} has none")
     if config.semantics == "auto":
-        chosen = (
-            "maps, chosen by auto (the source brings them)" if source.has_semantic else "none, chosen by auto"
-        )
+        chosen = "maps, chosen by auto (the source brings them)" if source.has_semantic else "none, chosen by auto"
         return f"semantics: {chosen}"
     return f"semantics: {config.semantics}"

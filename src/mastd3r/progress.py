@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from rich.console import Console
@@ -30,14 +30,9 @@ class Bar(Protocol):
 class Reporter(Protocol):
     """Where stages say how far they are."""
 
-    def stage(self, name: str, total: int | None, unit: str) -> _StageContext:
+    def stage(self, name: str, total: int | None, unit: str) -> AbstractContextManager[Bar]:
         """A context whose value is the stage's Bar."""
         ...
-
-
-class _StageContext(Protocol):
-    def __enter__(self) -> Bar: ...
-    def __exit__(self, *args: object) -> bool | None: ...
 
 
 class _Nothing:

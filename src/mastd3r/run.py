@@ -83,9 +83,7 @@ def run(
 def _camera_checked(config: Config) -> Config:
     given = config.camera.intrinsics
     if given and len(given) not in (4, 5):
-        raise ConfigError(
-            f"--intrinsics: expected fx,fy,cx,cy or fx,fy,cx,cy,k1 in pixels, got {len(given)} numbers"
-        )
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy or fx,fy,cx,cy,k1 in pixels, got {len(given)} numbers")
     if given and (not np.isfinite(given).all() or min(given[:2]) <= 0):
         raise ConfigError(f"--intrinsics: expected finite numbers with fx, fy > 0, got {given}")
     return config
@@ -94,9 +92,7 @@ def _camera_checked(config: Config) -> Config:
 class _Job:
     """One run in progress."""
 
-    def __init__(
-        self, source: Source, config: Config, slam: Slam, folder: RunFolder, reporter: Reporter
-    ) -> None:
+    def __init__(self, source: Source, config: Config, slam: Slam, folder: RunFolder, reporter: Reporter) -> None:
         self.source, self.config, self.slam, self.folder, self.reporter = (
             source,
             config,
@@ -118,9 +114,7 @@ class _Job:
             frames = self._track()
         with self._timed("joint optimisation"):
             self._solve()
-        lens_view = LensView(
-            self.full_camera(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px
-        )
+        lens_view = LensView(self.full_camera(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px)
         with self._timed("masks"):
             seen = self._look_again(lens_view)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
@@ -143,9 +137,7 @@ class _Job:
         if count < 2:
             raise InputError(f"{self.source.name}: expected at least 2 frames, got {count}")
         if not self.slam.graph.keyframes:
-            raise InputError(
-                f"{self.source.name}: expected pictures with something in them, got {count} blank frames"
-            )
+            raise InputError(f"{self.source.name}: expected pictures with something in them, got {count} blank frames")
         return count
 
     def _solve(self) -> None:

@@ -30,9 +30,7 @@ class SecondPass:
     """What one more pass over the frames gave."""
 
     views: list[View] = field(default_factory=list)  # for the map; no holdout frame among them
-    colors: dict[int, Array] = field(
-        default_factory=dict
-    )  # kf id -> (p, 3) uint8 at its px; no holdout frame
+    colors: dict[int, Array] = field(default_factory=dict)  # kf id -> (p, 3) uint8 at its px; no holdout frame
     moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px
     holdout: list[FinalFrame] = field(default_factory=list)
 
@@ -96,7 +94,7 @@ def _view(
 ) -> View:
     image, inside = lens_view.pinhole_image(frame.image)
     p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
-    static = np.clip(1 - lens_view.pinhole_map(p), 0, 1) * inside
+    static = np.clip(1 - lens_view.pinhole_map(p), 0.01, 1) * inside  # exactly 0 means: no data
     uncertainty = _uncertainty(place, graph, parts.size, lens_view)
     return View(
         frame.timestamp_s,
@@ -109,9 +107,7 @@ def _view(
     )
 
 
-def _uncertainty(
-    place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], lens_view: LensView
-) -> Array | None:
+def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], lens_view: LensView) -> Array | None:
     """u(p) of eq. (16) on a cell around each match whose residual is above tau_unc; None where there is none."""
     record, block = place.record, graph.blocks[place.record.kf_id]
     if len(record.points) == 0:
@@ -140,6 +136,4 @@ def _uncertainty(
 def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:
     """Eq. (16): u = e / max e over R = {e > tau²}, 0 elsewhere; e is a squared norm, tau is in pixels."""
     in_r = squared_error > tau_px**2
-    return (
-        np.where(in_r, squared_error / squared_error[in_r].max(), 0.0) if in_r.any() else np.zeros(len(in_r))
-    )
+    return np.where(in_r, squared_error / squared_error[in_r].max(), 0.0) if in_r.any() else np.zeros(len(in_r))

@@ -64,9 +64,7 @@ class Slam:
     def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
         self.config, self.parts = config, parts
         width, height = parts.size
-        self.graph = KeyframeGraph(
-            config.graph, config.camera, lens_for(config.camera, width, height, full_size)
-        )
+        self.graph = KeyframeGraph(config.graph, config.camera, lens_for(config.camera, width, height, full_size))
         self.belief = DynamicBelief(config.dynamics, width, height)
         self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
         self._flow: Array | None = None  # latest keyframe -> last frame
@@ -97,9 +95,7 @@ class Slam:
             kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
         return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
 
-    def _compare(
-        self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array
-    ) -> TwoView:
+    def _compare(self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array) -> TwoView:
         """Predict, mask and align one pair. Tracking, loops and recovery all come here."""
         graph, started = self.graph, self.graph.initialised
         block = graph.blocks[ref.id]
@@ -140,12 +136,12 @@ class Slam:
         last = self._last
         if last is not None and self._flow is not None and self.graph.records[-1].state == "tracked":
             kf = self._promote_last(*last)
-            view = self._compare(kf, work, prior, None, np.eye(4))
-            if self._believed(view):
-                return kf, view
+            near = self._compare(kf, work, prior, None, np.eye(4))
+            if self._believed(near):
+                return kf, near
         latest = self.graph.latest
         candidates = [latest, *self.parts.places.best(self.graph, work.gray, skip=latest.id)]
-        view = None
+        view: TwoView | None = None
         for kf in candidates:
             start = self.parts.features.flow(kf.work.gray, work.gray)
             if start is None and view is not None:
@@ -164,9 +160,7 @@ class Slam:
         kf = self.graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
         self.graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
         self.graph.replace_last_by_keyframe(kf)
-        self.graph.initialised = self.parts.provider.depth_sigma_ratio is not None and bool(
-            (info > 1).mean() > 0.1
-        )
+        self.graph.initialised = self.parts.provider.depth_sigma_ratio is not None and bool((info > 1).mean() > 0.1)
         self._flow, self._cam_from_kf, self._last = None, np.eye(4), (work, prior)
         return StepReport(work.index, work.timestamp_s, "started", kf.id, True, "first view")
 

@@ -37,9 +37,7 @@ class Truth:
 
     timestamps_s: Array  # (n,) float64
     world_from_cam: Array  # (n, 4, 4) float64; n may be 0
-    moving_files: dict[float, str] = field(
-        default_factory=dict
-    )  # the frame's timestamp_s -> 8-bit image, >127 moves
+    moving_files: dict[float, str] = field(default_factory=dict)  # the frame's timestamp_s -> 8-bit image, >127 moves
     focal_px: float | None = None  # at full width
 
 
@@ -69,9 +67,7 @@ class WorkFrame:
     grid: tuple[int, int]  # (rows, cols) of cells, p = rows * cols
     texture: Array  # (p,) float64 0..1, how well the pixel can be matched
     semantic: Array | None  # (h, w) float32 P(movable)
-    own_inv_depth: (
-        Array | None
-    )  # (h, w) float32 measured in this frame alone, 0 = none; None: no such measurement
+    own_inv_depth: Array | None  # (h, w) float32 measured in this frame alone, 0 = none; None: no such measurement
 
 
 @dataclass(frozen=True)
@@ -110,9 +106,7 @@ class PairPrediction:
     matches: Matches
     ref: Pointmap  # in ref's camera, at matches.ref_px
     new: Pointmap  # in ref's camera, at matches.new_px
-    new_own: (
-        Pointmap | None
-    )  # new's points in NEW's camera, where the provider measures depth in a frame alone
+    new_own: Pointmap | None  # new's points in NEW's camera, where the provider measures depth in a frame alone
     flow: Array  # (h, w, 2) float32 ref -> new
 
 

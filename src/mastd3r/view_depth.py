@@ -62,9 +62,7 @@ def predicted_depth(
     if not graph.initialised:
         return np.ones(len(work.px)), np.full(len(work.px), 1e-2)
     new_from_ref = cam_from_world @ inverse(block.cam_from_world)
-    value, _ = carried(
-        block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px
-    )
+    value, _ = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px)
     median = float(np.median(value))
     value = np.clip(value, 0.01 * median, 100 * median)
     info = np.full(len(value), 1e-3 / median**2)
@@ -94,9 +92,7 @@ def dynamics_input(
     """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics."""
     block, camera = graph.blocks[kf_id], graph.camera()
     new_from_ref = inverse(world_from_cam) @ inverse(block.cam_from_world)
-    value, trusted = carried(
-        block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px
-    )
+    value, trusted = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
     sigma = 0.1 * value * np.sqrt(1 / np.maximum(trusted, 1e-4) - 1) + 0.02 * value
     own = None if work.own_inv_depth is None else work.own_inv_depth / np.float32(scale)
     return DynamicsInput(

@@ -26,9 +26,7 @@ class IcpReport:
     inlier_ratio: float
 
 
-def icp(
-    points_ref: Array, points_new: Array, weight: Array, new_from_ref: Array, *, iterations: int = 30
-) -> IcpReport:
+def icp(points_ref: Array, points_new: Array, weight: Array, new_from_ref: Array, *, iterations: int = 30) -> IcpReport:
     """Point-to-point ICP on SE(3), eq. (8), started from matches row by row.
 
     Args: points_ref, points_new (n, 3) matched, each in its own camera; weight (n,).
@@ -54,9 +52,7 @@ def icp(
         moved = transform(pose, a)
         nearest_distance, nearest = tree.query(moved)
         own_distance = np.linalg.norm(moved - b, axis=1)
-        pair = np.where(
-            own_distance <= 1.5 * nearest_distance + 0.01 * moved[:, 2], np.arange(len(a)), nearest
-        )
+        pair = np.where(own_distance <= 1.5 * nearest_distance + 0.01 * moved[:, 2], np.arange(len(a)), nearest)
         if change < 1e-5:
             converged = True
             break

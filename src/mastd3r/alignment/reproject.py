@@ -63,9 +63,7 @@ class PoseReport:
     converged: bool
 
 
-def solve_pose(
-    matches: StaticMatches, new_from_ref: Array, *, kernel_px: float, iterations: int = 20
-) -> PoseReport:
+def solve_pose(matches: StaticMatches, new_from_ref: Array, *, kernel_px: float, iterations: int = 20) -> PoseReport:
     """Levenberg-Marquardt on SE(3); each depth is marginalised under its own information, so that a point
     without depth still fixes rotation and the direction across its epipolar line."""
     args = (matches.px, matches.inv_depth, matches.depth_info, matches.target, matches.weight)

@@ -12,9 +12,7 @@ from ..geometry.se3 import transform
 Array = NDArray[Any]
 
 
-def patch_scale(
-    depth_pre: Array, depth_new: Array, patch: Array, weight: Array, min_points: int = 5
-) -> float:
+def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array, min_points: int = 5) -> float:
     """Factor s that brings new's depths to the previous scale: median over patches of med(z_pre)/med(z_t).
 
     The paper prints the inverse ratio, which would double the error (paper-notes, (9)(10)).

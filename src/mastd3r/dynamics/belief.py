@@ -52,9 +52,7 @@ class DynamicBelief:
         self._flow = HalfFlow(self._w, self._h)
         self._past: deque[_Past] = deque(maxlen=1 + max(config.gaps))
         self._belief: Array | None = None  # log-odds of evidence at half size, without the semantic prior
-        self._carried: tuple[Array, Array | None, Array] | None = (
-            None  # small gray, flow to last, carried belief
-        )
+        self._carried: tuple[Array, Array | None, Array] | None = None  # small gray, flow to last, carried belief
         self._camera: Camera | None = None
         self._rays = np.zeros((3, self._h, self._w), np.float32)
 
@@ -79,7 +77,7 @@ class DynamicBelief:
             return DynamicMask(nothing, nothing > 0.5, {})
         if self.config.variant == "paper":
             return self._paper(given)
-        small, to_last, carried = self._carry(given.gray)
+        small, _to_last, carried = self._carry(given.gray)
         self._past.append(_Past(small, given.world_from_cam, np.zeros_like(carried)))
         evidence: dict[str, Array] = {}
         fresh = np.zeros((self._h, self._w), np.float32)
@@ -157,9 +155,7 @@ class DynamicBelief:
         near = float(np.median(rigid.inv_depth[step, step])) + 1e-9
         limit = np.deg2rad(self.config.pose_doubt_deg)
         sigma = np.array([limit / near] * 3 + [limit] * 3)
-        part = pose_jacobian(
-            rigid.xy[step, step].reshape(-1, 2), rigid.inv_depth[step, step].ravel(), focal_px
-        )
+        part = pose_jacobian(rigid.xy[step, step].reshape(-1, 2), rigid.inv_depth[step, step].ravel(), focal_px)
         twist = residual_twist(
             part.astype(float),
             residual[step, step].reshape(-1, 2).astype(float),
@@ -187,10 +183,7 @@ class DynamicBelief:
                 seen = self._flow.pull(self._past[-1].gray.astype(np.float32), to_last, -100.0)
                 noise = photo_variance(texture_information(small, 5, self.config.texture_noise), self.config)
                 same = np.exp(
-                    -0.5
-                    * np.maximum(
-                        mismatch(small.astype(np.float32), seen, noise) - self.config.carry_mismatch, 0
-                    )
+                    -0.5 * np.maximum(mismatch(small.astype(np.float32), seen, noise) - self.config.carry_mismatch, 0)
                 )
                 carried = self.config.memory * same * self._flow.pull(self._belief, to_last)
         self._carried = (small, to_last, carried)
@@ -256,9 +249,7 @@ class DynamicBelief:
 
     def _check(self, image: Array, name: str) -> None:
         if image.shape != (self.height, self.width):
-            raise InputError(
-                f"dynamics: expected {name} of {self.width}x{self.height}, got shape {image.shape}"
-            )
+            raise InputError(f"dynamics: expected {name} of {self.width}x{self.height}, got shape {image.shape}")
 
 
 def _sigmoid(log_odds: Array) -> Array:

@@ -15,16 +15,14 @@ class HalfFlow:
     """DIS flow between two small grey images of one size; optionally started from a prediction."""
 
     def __init__(self, width: int, height: int) -> None:
-        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._dis.setFinestScale(1)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self.grid = np.stack([x, y], -1)
 
     def between(self, a: Array, b: Array, start: Array | None = None) -> Array:
         """(h, w, 2) float32 flow a -> b."""
-        flow: Array = self._dis.calc(
-            a, b, None if start is None else np.ascontiguousarray(start.astype(np.float32))
-        )
+        flow: Array = self._dis.calc(a, b, None if start is None else np.ascontiguousarray(start.astype(np.float32)))
         return flow
 
     def pull(self, value: Array, flow: Array, outside: float = 0.0) -> Array:

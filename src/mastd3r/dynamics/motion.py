@@ -52,9 +52,7 @@ def pose_jacobian(xy: Array, inv_depth: Array, focal_px: float) -> Array:
     return focal_px * np.stack([np.stack(rows_x, -1), np.stack(rows_y, -1)], -2)
 
 
-def residual_twist(
-    jacobian: Array, residual: Array, weight: Array, noise_px: float, prior_sigma: Array
-) -> Array:
+def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: float, prior_sigma: Array) -> Array:
     """(6,) twist that explains the residual (n, 2) of the static majority: reweighted least squares, Cauchy weights.
 
     ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): how far a pose may be off before it is doubted.

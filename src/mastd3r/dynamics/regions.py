@@ -18,9 +18,7 @@ def box(image: Array, radius_px: int) -> Array:
     return cv2.blur(image, (size, size), borderType=cv2.BORDER_REFLECT)
 
 
-def guided_coefficients(
-    guide: Array, value: Array, weight: Array, radius_px: int, edge: float
-) -> tuple[Array, Array]:
+def guided_coefficients(guide: Array, value: Array, weight: Array, radius_px: int, edge: float) -> tuple[Array, Array]:
     """(a, b), each (h, w): around every pixel value ~ a·guide + b, a weighted least-squares line.
 
     ``edge`` is the guide's contrast (its own unit) that counts as an edge; the slope fades where the weights do.

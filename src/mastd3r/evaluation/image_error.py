@@ -64,9 +64,7 @@ def ssim(a: Array, b: Array, where: Array | None = None) -> float | None:
 def _pair(a: Array, b: Array, where: Array | None) -> tuple[Array, Array]:
     a, b = np.ascontiguousarray(a, float), np.ascontiguousarray(b, float)
     if a.shape != b.shape or a.ndim != 3:
-        raise InputError(
-            f"image error: expected two (h, w, 3) images of one shape, got {a.shape} and {b.shape}"
-        )
+        raise InputError(f"image error: expected two (h, w, 3) images of one shape, got {a.shape} and {b.shape}")
     if where is not None and where.shape != a.shape[:2]:
         raise InputError(f"image error: expected pixels to compare of shape {a.shape[:2]}, got {where.shape}")
     return a, b

@@ -187,9 +187,7 @@ def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float =
 def rotation_angle_rad(rotation: Array) -> Array:
     """(..., 3, 3) rotations to (...) angles in 0..pi; exact near 0, where arccos of the trace is not."""
     r = rotation
-    axis = np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
-    )
+    axis = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=-1), np.trace(r, axis1=-2, axis2=-1) - 1))
 
 

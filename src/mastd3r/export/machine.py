@@ -77,10 +77,7 @@ def _peak_rss_windows_mib() -> float:
         _fields_ = (
             ("cb", ctypes.c_ulong),
             ("page_faults", ctypes.c_ulong),
-            *(
-                (name, ctypes.c_size_t)
-                for name in ("peak_working_set", "working_set", "a", "b", "c", "d", "e", "f")
-            ),
+            *((name, ctypes.c_size_t) for name in ("peak_working_set", "working_set", "a", "b", "c", "d", "e", "f")),
         )
 
     counters = Counters()

@@ -19,9 +19,7 @@ MOVING_COLOUR = (255.0, 98.0, 0.0)
 
 def data_uri(image: Array) -> str:
     """An image as a JPEG data URI, so that a page needs no other file."""
-    done, data = cv2.imencode(
-        ".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    )
+    done, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise OutputError(f"report: expected an image of some size, got shape {image.shape}")
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
@@ -42,9 +40,7 @@ def mask_overlay(image: Array, probability: Array) -> Array:
     alpha = (0.6 / 255 * p.astype(np.float32))[..., None]
     grey = image.mean(2, keepdims=True, dtype=np.float32)
     base = 0.75 * image + 0.25 * grey
-    out = np.ascontiguousarray(
-        np.clip(base * (1 - alpha) + np.array(MOVING_COLOUR) * alpha, 0, 255).astype(np.uint8)
-    )
+    out = np.ascontiguousarray(np.clip(base * (1 - alpha) + np.array(MOVING_COLOUR) * alpha, 0, 255).astype(np.uint8))
     outlines, _ = cv2.findContours((p > 127).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     thickness = max(1, round(size[0] / 400))
     return np.asarray(cv2.drawContours(out, outlines, -1, (255, 255, 255), thickness, cv2.LINE_AA))

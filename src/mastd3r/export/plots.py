@@ -17,9 +17,7 @@ STATE_NAMES = {"started": "tracked", "tracked": "tracked", "interpolated": "inte
 MAX_POINTS = 1500  # of one line; more than the plot has pixels
 
 
-def top_view(
-    trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None
-) -> str:
+def top_view(trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None) -> str:
     """The path seen from above, equal axes, the longest extent lying across.
 
     ``positions`` (n, 3) in ``unit``; ``truth`` (n, 3) likewise, NaN where there is none. ``error`` (n,)
@@ -28,9 +26,7 @@ def top_view(
     plane = ground_axes(trajectory, positions)
     flat = positions @ plane.T
     true_flat = truth @ plane.T if truth is not None else None
-    everything = (
-        flat if true_flat is None else np.concatenate([flat, true_flat[np.isfinite(true_flat).all(1)]])
-    )
+    everything = flat if true_flat is None else np.concatenate([flat, true_flat[np.isfinite(true_flat).all(1)]])
     low, high = everything.min(0), everything.max(0)
     span = float((high - low).max())
     span = span if span > 1e-9 else 1.0  # a camera that never moves: a dot in the middle
@@ -59,9 +55,7 @@ def top_view(
     return _svg(height, out, "trajectory from above")
 
 
-def over_time(
-    trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None
-) -> str:
+def over_time(trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None) -> str:
     """Right, down and forward of the first camera over time, and the error below where truth gives one."""
     times = trajectory.timestamps_s - trajectory.timestamps_s[0]
     names = [("right", 0), ("down", 1), ("forward", 2)]
@@ -102,9 +96,7 @@ def over_time(
         out.append(_label(left, top - 8, f"{title}, {unit}", "start", "name"))
     foot = height - 26
     for tick in ticks(0, duration, 10):
-        out.append(
-            _label(left + tick / duration * (WIDTH - left - right), foot, number(tick, duration), "middle")
-        )
+        out.append(_label(left + tick / duration * (WIDTH - left - right), foot, number(tick, duration), "middle"))
     out.append(_label(WIDTH / 2, height - 6, "seconds from the first frame", "middle"))
     return _svg(height, out, "position over time")
 
@@ -120,9 +112,7 @@ def timing_bars(timings_s: dict[str, float]) -> str:
     for row, (stage, seconds) in enumerate(timings_s.items()):
         y = 6 + row * step
         out.append(_label(left - 10, y + 15, stage, "end", "name"))
-        out.append(
-            f'<rect class="bar" x="{left}" y="{y}" width="{bar * seconds / longest:.1f}" height="20" rx="3"/>'
-        )
+        out.append(f'<rect class="bar" x="{left}" y="{y}" width="{bar * seconds / longest:.1f}" height="20" rx="3"/>')
         text = f"{seconds:.1f} s · {100 * seconds / total:.0f} %"
         out.append(_label(left + bar * seconds / longest + 8, y + 15, text, "start"))
     return _svg(len(timings_s) * step + 8, out, "seconds of each stage")

@@ -151,9 +151,7 @@ def _trajectory(data: ReportData) -> str:
     keyframes = int(data.trajectory.is_keyframe.sum())
     text = f"{len(data.positions)} poses, {keyframes} of them keyframes. "
     if data.truth is not None:
-        text += (
-            "Scaled and turned to fit truth (Sim(3), all frames); the view from above is coloured by error."
-        )
+        text += "Scaled and turned to fit truth (Sim(3), all frames); the view from above is coloured by error."
     else:
         text += "A single camera cannot tell the scale: lengths are map units."
     legend = _legend(data, error is not None)
@@ -173,10 +171,7 @@ def _legend(data: ReportData, has_truth: bool) -> str:
 def _numbers(metrics: Mapping[str, Any]) -> str:
     if not metrics:
         return ""
-    rows = [
-        f"<tr><td>{escape(described(key))}</td>{_value_cell(key, value)}</tr>"
-        for key, value in in_order(metrics)
-    ]
+    rows = [f"<tr><td>{escape(described(key))}</td>{_value_cell(key, value)}</tr>" for key, value in in_order(metrics)]
     half = (len(rows) + 1) // 2
     tables = "".join(f"<table>{''.join(part)}</table>" for part in (rows[:half], rows[half:]) if part)
     return _section("Figures", "", f'<div class="row two">{tables}</div>')

@@ -116,9 +116,7 @@ class RunFolder:
         """renders/<timestamp>.png: (h, w, 3) RGB, uint8 or float in 0..1."""
         if image.dtype != np.uint8:
             if not np.isfinite(image).all():
-                raise OutputError(
-                    f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not"
-                )
+                raise OutputError(f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not")
             image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
         self._write_png("renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
 

@@ -176,9 +176,7 @@ def edge_residuals(px: Array, depth: Array, target: Array, j_from_i: Array, g: A
     z = np.empty(p)
     for n in range(p):
         jac = np.empty((2, N_COLS))
-        rx, ry, _, _, yz = _edge_point(
-            px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, jac
-        )
+        rx, ry, _, _, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, jac)
         z[n] = yz
         out[n, 0] = rx if yz >= MIN_DEPTH else 1e3
         out[n, 1] = ry if yz >= MIN_DEPTH else 1e3
@@ -210,9 +208,7 @@ def pose_system(
         w = weight[n]
         if w <= 0.0:
             continue
-        rx, ry, a, b, yz = _edge_point(
-            px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, jac
-        )
+        rx, ry, a, b, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, jac)
         if yz < MIN_DEPTH:
             cost += w * c2 * 4.0
             continue

@@ -83,9 +83,7 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
 def interpolate(world_from_a: Array, world_from_b: Array, ratio: float) -> Array:
     """Pose between a (ratio 0) and b (ratio 1): straight line and constant angular velocity."""
     out = np.eye(4)
-    out[:3, :3] = world_from_a[:3, :3] @ so3_exp(
-        ratio * so3_log(world_from_a[:3, :3].T @ world_from_b[:3, :3])
-    )
+    out[:3, :3] = world_from_a[:3, :3] @ so3_exp(ratio * so3_log(world_from_a[:3, :3].T @ world_from_b[:3, :3]))
     out[:3, 3] = (1 - ratio) * world_from_a[:3, 3] + ratio * world_from_b[:3, 3]
     return out
 

@@ -148,17 +148,13 @@ def _linearise(
     for i, edges in by_host.items():
         block = blocks[i]
         target, weight, j_from_i = _gather(blocks, edges)
-        h, b, e, hdd, bd, cost = host_system(
-            block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px
-        )
+        h, b, e, hdd, bd, cost = host_system(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px)
         total += float(cost.sum())
         block.depth_info = hdd.sum(0)
         hdd_i = block.depth_info + block.prior_info + 1e-9
         bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
         local_h, local_b, cross = _host_local(h, b, e, j_from_i)
-        columns = np.concatenate(
-            [_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols]
-        )
+        columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
         scaled = cross / hdd_i[:, None]
         local_h -= scaled.T @ cross
         local_b -= scaled.T @ bd_i
@@ -223,9 +219,7 @@ def _apply(
     return saved
 
 
-def _restore(
-    blocks: dict[int, Block], lens: Lens, saved: tuple[Array, dict[int, tuple[Array, Array]]]
-) -> None:
+def _restore(blocks: dict[int, Block], lens: Lens, saved: tuple[Array, dict[int, tuple[Array, Array]]]) -> None:
     lens.g = saved[0]
     for k, (pose, depth) in saved[1].items():
         blocks[k].cam_from_world, blocks[k].inv_depth = pose, depth
@@ -245,7 +239,5 @@ def _cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, 
     for i, edges in by_host.items():
         target, weight, j_from_i = _gather(blocks, edges)
         block = blocks[i]
-        total += float(
-            host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum()
-        )
+        total += float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
     return total

@@ -55,7 +55,8 @@ def carried(
     if ok.sum() < 8:
         return np.full(len(at_px), float(np.median(inv_depth))), np.zeros(len(at_px))
     landed, new_inv = camera.project(points[ok]), 1 / points[ok][:, 2]
-    distance, nearest = cKDTree(landed).query(at_px, k=3)
+    found = cKDTree(landed).query(at_px, k=3)
+    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
     weight = t[ok][nearest] / (distance + 1.0)
     value = (new_inv[nearest] * weight).sum(1) / weight.sum(1)
     near = np.exp(-((distance[:, 0] / 24.0) ** 2))

@@ -161,11 +161,7 @@ class KeyframeGraph:
         near = active | {e.j for e in edges}
         whole = len(near) == n and n <= size
         fixed = frozenset([0]) if whole else frozenset((near - active) | {min(active)})
-        lens = (
-            self.lens
-            if n <= 2 * size or n % 4 == 0
-            else Lens(self.lens.g, self.lens.prior, np.full(4, np.inf))
-        )
+        lens = self.lens if n <= 2 * size or n % 4 == 0 else Lens(self.lens.g, self.lens.prior, np.full(4, np.inf))
         report = solve(
             {k: self.blocks[k] for k in sorted(near)},
             edges,

@@ -47,9 +47,7 @@ def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_over
 
 def thumbnail(gray: Array) -> Array:
     """A place descriptor without weights: 24 x 18 blurred picture, zero mean, unit norm, (432,) float32."""
-    small = cv2.GaussianBlur(
-        cv2.resize(gray, (24, 18), interpolation=cv2.INTER_AREA).astype(np.float32), (0, 0), 1.0
-    )
+    small = cv2.GaussianBlur(cv2.resize(gray, (24, 18), interpolation=cv2.INTER_AREA).astype(np.float32), (0, 0), 1.0)
     small -= small.mean()
     return (small / max(float(np.linalg.norm(small)), 1e-6)).reshape(-1)
 

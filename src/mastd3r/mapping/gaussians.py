@@ -88,14 +88,10 @@ class GaussianMap:
             rows = torch.nonzero(self.kf_id == kf)[:, 0]
             if len(rows) == 0:
                 continue
-            change = np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(
-                np.asarray(old_world_from_kf[kf], float)
-            )
+            change = np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(np.asarray(old_world_from_kf[kf], float))
             scale = float(np.cbrt(np.linalg.det(change[:3, :3])))
             linear, shift = (torch.from_numpy(c.copy()) for c in (change[:3, :3], change[:3, 3]))
-            means[rows] = (means[rows].double() @ linear.T.to(means.device) + shift.to(means.device)).to(
-                means
-            )
+            means[rows] = (means[rows].double() @ linear.T.to(means.device) + shift.to(means.device)).to(means)
             turn = torch.from_numpy(quaternion_from_rotation(change[:3, :3] / scale)).to(quats)
             quats[rows] = quaternion_product(turn, quats[rows])
             log_scales[rows] += float(np.log(scale))

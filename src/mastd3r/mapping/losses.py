@@ -27,9 +27,7 @@ def static_weight(static: torch.Tensor, dynamic_weight: float, hard: bool) -> to
     """
     moving = 1 - static
     if hard:
-        weight = torch.where(
-            moving > MOVING, torch.full_like(static, dynamic_weight), torch.ones_like(static)
-        )
+        weight = torch.where(moving > MOVING, torch.full_like(static, dynamic_weight), torch.ones_like(static))
     else:
         weight = 1 - (1 - dynamic_weight) * moving
     return weight * (static > 0)

@@ -58,9 +58,7 @@ class Mapper:
         self.config, self._rates, self._device = config, rates or TrainingRates(), device
         self._map = seed_gaussians(cloud, max(1, int(config.max_gaussians * SEED_SHARE)), seed, device)
         self._adam = RowAdam(self._map.parameters())
-        self._policy = DensifyPolicy(
-            config.max_gaussians, config.iterations, seed, densify or DensifySettings()
-        )
+        self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
         self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, device)
         self._background = _mean_color(self._views).to(device)
@@ -103,9 +101,7 @@ class Mapper:
             depth = torch.where(alpha > 0.5, depth / alpha.clamp_min(1e-6), torch.zeros_like(depth))
         return color.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), alpha.cpu().numpy()
 
-    def move_keyframes(
-        self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]
-    ) -> None:
+    def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""
         self._map = self._map.moved(old_world_from_kf, new_world_from_kf)
         self._view_parameters.move_keyframes(old_world_from_kf, new_world_from_kf)
@@ -137,9 +133,7 @@ class Mapper:
 
     def _loss(self, color: torch.Tensor, view: View) -> torch.Tensor:
         c = self.config
-        target, static = (
-            torch.from_numpy(np.ascontiguousarray(a)).to(color) for a in (view.image, view.static)
-        )
+        target, static = (torch.from_numpy(np.ascontiguousarray(a)).to(color) for a in (view.image, view.static))
         u = None if view.uncertainty is None else torch.from_numpy(view.uncertainty).to(color)
         paper = c.paper_loss
         weight = pixel_weight(c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, paper)

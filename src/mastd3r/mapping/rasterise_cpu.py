@@ -46,9 +46,7 @@ class _Rasterise(torch.autograd.Function):
         image = np.empty((height, width, CHANNELS), np.float32)
         transmittance, stop = np.empty((height, width), np.float32), np.empty(columns * rows, np.int64)
         tile_input = (*pairs[:2], centre, conic, inputs[3], features)
-        in_blocks(
-            tiles_forward, rows * columns, width, height, columns, *tile_input, image, transmittance, stop
-        )
+        in_blocks(tiles_forward, rows * columns, width, height, columns, *tile_input, image, transmittance, stop)
         ctx.state = inputs, view_array, lens, radius, pairs, tile_input, image, transmittance, stop, columns
         ctx.stats = stats
         if stats is not None:

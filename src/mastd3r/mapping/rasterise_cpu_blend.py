@@ -92,9 +92,7 @@ def _features(builder: Any, base: Any, gaussian: Any) -> list[Any]:
 
 
 @intrinsic
-def blend_forward(
-    typing, tile, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, gaussian
-):
+def blend_forward(typing, tile, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, gaussian):
     """Add one Gaussian to a tile, front to back: color += T alpha f, T *= 1 - alpha."""
     signature = types.void(tile, *([types.intp] * 4), *_SCALARS, features, types.intp)
 
@@ -141,9 +139,7 @@ class _Sums:
 
 
 @intrinsic
-def blend_backward(
-    typing, tile, sums, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, gaussian
-):
+def blend_backward(typing, tile, sums, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, gaussian):
     """Repeat ``blend_forward`` and sum the loss gradients of one Gaussian over the tile into ``sums``.
 
     The plane ``behind`` starts as grad · final colour - T_end · grad_alpha and loses each Gaussian's own

@@ -193,12 +193,8 @@ def tiles_backward(
         _start_backward(tile, x0, y0, rows, cols, image, transmittance, image_grad, alpha_grad)
         for pair in range(tile_start[t], stop[t]):
             g = pair_gaussian[pair]
-            a, b, c, opacity, x, y, power_max, row0, row1, half0, half1 = _reach(
-                g, centre, conic, opacities, x0, y0
-            )
-            blend_backward(
-                tile, lanes, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, g
-            )
+            a, b, c, opacity, x, y, power_max, row0, row1, half0, half1 = _reach(g, centre, conic, opacities, x0, y0)
+            blend_backward(tile, lanes, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, g)
             for i in range(SUMS):
                 total = _F(0)
                 for lane in range(_LANES):

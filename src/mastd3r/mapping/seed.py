@@ -25,9 +25,7 @@ def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu
     spacing = np.asarray(cloud.spacing, np.float32)
     usable = np.flatnonzero(np.isfinite(points).all(1) & np.isfinite(spacing) & (spacing > 0))
     if len(usable) == 0:
-        raise InputError(
-            f"Gaussian map: expected static points to start from, got none of {len(points)} usable"
-        )
+        raise InputError(f"Gaussian map: expected static points to start from, got none of {len(points)} usable")
     rows = _fair_draw(usable, np.asarray(cloud.kf_id)[usable], limit, seed)
     growth = np.sqrt(len(usable) / len(rows))
     log_scales = np.log(spacing[rows] * SIGMA_OF_SPACING * growth)[:, None].repeat(3, 1)
@@ -45,9 +43,7 @@ def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu
         name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
         for name, array in tensors.items()
     }
-    return GaussianMap(
-        **leaves, kf_id=torch.tensor(np.asarray(cloud.kf_id)[rows].astype(np.int32), device=device)
-    )
+    return GaussianMap(**leaves, kf_id=torch.tensor(np.asarray(cloud.kf_id)[rows].astype(np.int32), device=device))
 
 
 def _fair_draw(rows: np.ndarray, kf_id: np.ndarray, limit: int, seed: int) -> np.ndarray:

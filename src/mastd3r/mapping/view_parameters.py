@@ -27,9 +27,7 @@ class ViewParameters:
         self._kf_id = [v.kf_id for v in views]
         self._world_from_cam = [np.asarray(v.world_from_cam, float) for v in views]
         self._cam_from_world = [torch.from_numpy(np.linalg.inv(p)).to(device) for p in self._world_from_cam]
-        self._rows = [
-            {name: torch.zeros(3, device=device, requires_grad=True) for name in _NAMES} for _ in views
-        ]
+        self._rows = [{name: torch.zeros(3, device=device, requires_grad=True) for name in _NAMES} for _ in views]
         self._adams = [RowAdam(row) for row in self._rows]
         self._refine_poses, self._depth = refine_poses, depth
 
@@ -71,9 +69,7 @@ class ViewParameters:
         rates = {"log_gain": _EXPOSURE_RATE, "bias": _EXPOSURE_RATE, "shift": pose_rate, "turn": pose_rate}
         self._adams[number].step(self._rows[number], rates)
 
-    def move_keyframes(
-        self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]
-    ) -> None:
+    def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Views follow their keyframes; a scale in the correction moves their centres only."""
         for i, kf in enumerate(self._kf_id):
             if kf not in old_world_from_kf or kf not in new_world_from_kf:

@@ -11,9 +11,7 @@ class PointmapProvider(Protocol):
     """Two methods: look at one frame, and at a pair. A network adds one file that has them."""
 
     name: str
-    depth_sigma_ratio: (
-        float | None
-    )  # relative 1-sigma of the depth measured in one frame; None: measures none
+    depth_sigma_ratio: float | None  # relative 1-sigma of the depth measured in one frame; None: measures none
 
     def observe(self, frame: Frame) -> WorkFrame:
         """What can be said of a frame alone: working image, pixels to match, own depth."""

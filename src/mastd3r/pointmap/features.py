@@ -15,7 +15,7 @@ class FeatureStart:
     """ORB features, mutual matches, RANSAC homography; answers with a dense start for the flow."""
 
     def __init__(self, features: int = 1500, min_inliers: int = 18) -> None:
-        self._orb = cv2.ORB_create(nfeatures=features, fastThreshold=8)
+        self._orb = cv2.ORB.create(nfeatures=features, fastThreshold=8)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self.min_inliers = min_inliers
 

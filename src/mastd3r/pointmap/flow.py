@@ -27,7 +27,7 @@ class FlowMatcher:
     def __init__(self, width: int, height: int, window_px: int = 13, tolerance_px: float = 1.0) -> None:
         self.width, self.height = width, height
         self.tolerance_px = tolerance_px
-        self._dis = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self._grid = np.stack([x, y], -1)
         self._lk: dict[str, Any] = {
@@ -69,10 +69,7 @@ class FlowMatcher:
         xy = forward[:, 0]
         target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
         inside = (
-            (target[:, 0] > 1)
-            & (target[:, 1] > 1)
-            & (target[:, 0] < self.width - 2)
-            & (target[:, 1] < self.height - 2)
+            (target[:, 0] > 1) & (target[:, 1] > 1) & (target[:, 0] < self.width - 2) & (target[:, 1] < self.height - 2)
         )
         ok = inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < self.tolerance_px) & (moved < 6.0)
         weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
@@ -87,9 +84,7 @@ def corner_grid(gray: Array, cell_px: int) -> tuple[Array, Array]:
     strength = cv2.cornerMinEigenVal(gray, 5, ksize=3)
     h, w = gray.shape[0] // cell_px * cell_px, gray.shape[1] // cell_px * cell_px
     rows, cols = h // cell_px, w // cell_px
-    cells = (
-        strength[:h, :w].reshape(rows, cell_px, cols, cell_px).transpose(0, 2, 1, 3).reshape(rows * cols, -1)
-    )
+    cells = strength[:h, :w].reshape(rows, cell_px, cols, cell_px).transpose(0, 2, 1, 3).reshape(rows * cols, -1)
     best = cells.argmax(1)
     cy, cx = np.divmod(np.arange(rows * cols), cols)
     px = np.stack([cx * cell_px + best % cell_px, cy * cell_px + best // cell_px], 1).astype(float)

@@ -42,9 +42,7 @@ class GeometricPointmaps:
         if frame.semantic is not None:
             semantic = cv2.resize(frame.semantic.astype(np.float32), (self.width, self.height))
         grid = (self.height // self.cell_px, self.width // self.cell_px)
-        return WorkFrame(
-            frame.index, frame.timestamp_s, gray, px, grid, texture, semantic, self._own_inv_depth(frame)
-        )
+        return WorkFrame(frame.index, frame.timestamp_s, gray, px, grid, texture, semantic, self._own_inv_depth(frame))
 
     def _own_inv_depth(self, frame: Frame) -> Array | None:
         return None
@@ -62,9 +60,7 @@ class GeometricPointmaps:
             new_map = Pointmap(found.target, points, confidence)
             if guess.ref_inv_depth is None:
                 ref_map = Pointmap(ref.px, points, confidence)
-        return PairPrediction(
-            matches, ref_map, new_map, self._own_points(new, matches, guess.camera), found.dense
-        )
+        return PairPrediction(matches, ref_map, new_map, self._own_points(new, matches, guess.camera), found.dense)
 
     def _own_points(self, new: WorkFrame, matches: Matches, camera: Camera) -> Pointmap | None:
         return None
@@ -93,9 +89,7 @@ def triangulate(matches: Matches, new_from_ref: Array, camera: Camera) -> tuple[
     b = rays_new[:, :2] * rotated[:, 2:] - rotated[:, :2]
     norm = (a**2).sum(1)
     inv_depth = (a * b).sum(1) / np.maximum(norm, 1e-12)
-    epipolar_px = (
-        np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px
-    )
+    epipolar_px = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px
     sigma = 1 / (np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px)
     sure = 1 / (1 + (sigma / np.maximum(inv_depth, 1e-6) / 0.1) ** 2)
     confidence = matches.weight * sure * np.exp(-0.5 * epipolar_px**2) * (inv_depth > 0)

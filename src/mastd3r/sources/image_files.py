@@ -94,7 +94,5 @@ def _map_values(path: Path, expected: str) -> Array:
         image = _opened(path, expected)
         values = np.asarray(image.convert("L") if image.mode in ("P", "LA", "RGB", "RGBA") else image)
     if values.ndim != 2 or values.size == 0 or values.dtype.kind not in "iufb":
-        raise InputError(
-            f"{path}: expected {expected}, one number a pixel, got {values.dtype} {values.shape}"
-        )
+        raise InputError(f"{path}: expected {expected}, one number a pixel, got {values.dtype} {values.shape}")
     return values

@@ -26,9 +26,7 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 def image_files(folder: Path) -> list[Path]:
     """The image files right in ``folder``, hidden ones left out, in natural order."""
     found = [
-        p
-        for p in folder.iterdir()
-        if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and p.is_file()
+        p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and p.is_file()
     ]
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 

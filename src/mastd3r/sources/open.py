@@ -42,9 +42,7 @@ def open_source(
     if not path.is_dir():
         raise InputError(f"{path}: expected a file or a folder, got something else")
     if (path / "rgb.txt").is_file():
-        return TumSource(
-            path, config, want_depth=want_depth, want_semantic=want_semantic, semantic_dir=semantic_dir
-        )
+        return TumSource(path, config, want_depth=want_depth, want_semantic=want_semantic, semantic_dir=semantic_dir)
     _refuse_without_images(path)
     return ImageFolderSource(path, config, want_semantic=want_semantic, semantic_dir=semantic_dir)
 

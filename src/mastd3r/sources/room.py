@@ -94,14 +94,10 @@ class Room:
         points = world_from_cam[:3, 3, None].astype(np.float32) + rays * hit.depth
         slant = np.abs(_dot(rays, hit.normal)) / grid.length
         texel_px = np.float32(1 / (grid.camera.fx_px * tex.TEXEL_M))
-        colour = self.atlas.sample(
-            hit.texture, hit.uv, hit.depth * texel_px / np.sqrt(np.maximum(slant, 0.05))
-        )
+        colour = self.atlas.sample(hit.texture, hit.uv, hit.depth * texel_px / np.sqrt(np.maximum(slant, 0.05)))
         to_light = LIGHT[:, None] - points
         away2 = _dot(to_light, to_light)
-        lambert = np.maximum(_dot(to_light, hit.normal), 0) / (
-            np.sqrt(away2) * (1 + np.float32(0.06) * away2)
-        )
+        lambert = np.maximum(_dot(to_light, hit.normal), 0) / (np.sqrt(away2) * (1 + np.float32(0.06) * away2))
         x, y, z = np.minimum(points - ROOM_LOW[:, None], ROOM_HIGH[:, None] - points)
         second = np.maximum(np.minimum(x, y), np.minimum(np.maximum(x, y), z))  # of the three distances
         corner = 1 - np.float32(0.3) * np.exp(np.maximum(second, 0) * np.float32(-1 / 0.22))
@@ -207,9 +203,7 @@ def _darken_floor(floor: Array, boxes: list[Box]) -> None:
         at = corners @ turn.T + np.array([box.centre[0], box.centre[2]]) - ROOM_LOW[[0, 2]]
         one = np.zeros((h, w), np.float32)
         cv2.fillPoly(one, [np.rint(at / tex.TEXEL_M).astype(np.int32)], 1.0)
-        shadow = np.maximum(
-            shadow, cv2.GaussianBlur(one, (0, 0), 8 + 30 * max(lift, 0)) / (1 + 0.8 * max(lift, 0))
-        )
+        shadow = np.maximum(shadow, cv2.GaussianBlur(one, (0, 0), 8 + 30 * max(lift, 0)) / (1 + 0.8 * max(lift, 0)))
     floor *= (1 - 0.55 * shadow)[..., None]
 
 
@@ -276,9 +270,7 @@ def _cast_box(box: Box, rays: Array, origin: Array, rows: Array, hit: Hit) -> No
     hit.depth[rows] = near
     hit.texture[rows] = np.where(on_y, box.texture + 1, box.texture)
     hit.uv[:, rows] = np.where(on_y, x, across), np.where(on_y, z, y)
-    hit.normal[:, rows] = turn @ (-np.sign(d) * np.stack([on_x & ~on_y, on_y, ~(on_x | on_y)])).astype(
-        np.float32
-    )
+    hit.normal[:, rows] = turn @ (-np.sign(d) * np.stack([on_x & ~on_y, on_y, ~(on_x | on_y)])).astype(np.float32)
 
 
 def _cast_ball(rays: Array, origin: Array, time_s: float, texture: int, hit: Hit) -> None:

@@ -119,9 +119,7 @@ def drawers(colour: Sequence[float], rows: int, columns: int) -> Texture:
 def painting(height_m: float, width_m: float, rng: Rng) -> Array:
     """A framed picture: discs, boxes and lines over a coloured ground."""
     h, w = texels(height_m), texels(width_m)
-    image = np.ascontiguousarray(
-        rng.uniform(90, 200, 3).astype(np.float32) + noise(h, w, rng, 64, 4)[..., None] * 18
-    )
+    image = np.ascontiguousarray(rng.uniform(90, 200, 3).astype(np.float32) + noise(h, w, rng, 64, 4)[..., None] * 18)
     for _ in range(26):
         colour = tuple(float(v) for v in rng.uniform(10, 245, 3))
         at = (int(rng.uniform(0, w)), int(rng.uniform(0, h)))

@@ -29,9 +29,7 @@ def nearest_time(times_s: np.ndarray, wanted_s: np.ndarray, tolerance_s: float =
     return np.where(np.abs(times_s[best] - wanted_s) <= tolerance_s + 1e-9, best, -1)
 
 
-def match_maps(
-    folder: Path, stems: Mapping[int, str], times_s: Mapping[int, float], notes: Notes
-) -> dict[int, Path]:
+def match_maps(folder: Path, stems: Mapping[int, str], times_s: Mapping[int, float], notes: Notes) -> dict[int, Path]:
     """Which file of ``folder`` belongs to which frame index: frame index -> path. Raises InputError.
 
     Files are .png or .npy, named all in one way: as the frame's own file, by frame index (counted before
@@ -43,9 +41,7 @@ def match_maps(
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in MAP_SUFFIXES and not path.name.startswith("."):
             if path.stem in files:
-                raise InputError(
-                    f"{folder}: expected one map a frame, got {files[path.stem].name} and {path.name}"
-                )
+                raise InputError(f"{folder}: expected one map a frame, got {files[path.stem].name} and {path.name}")
             files[path.stem] = path
     if not files:
         raise InputError(f"{folder}: expected probability maps ({', '.join(MAP_SUFFIXES)}), got none")
@@ -56,12 +52,8 @@ def match_maps(
         way, found = _by_time(files, times_s)
     if not found:
         example = next(iter(files.values())).name
-        raise InputError(
-            f"{folder}: expected maps named as the frames, by frame index or by timestamp, got {example}"
-        )
-    notes.put(
-        "semantic", f"probability maps from {folder.name} by {way}: {len(found)} of {len(times_s)} frames"
-    )
+        raise InputError(f"{folder}: expected maps named as the frames, by frame index or by timestamp, got {example}")
+    notes.put("semantic", f"probability maps from {folder.name} by {way}: {len(found)} of {len(times_s)} frames")
     return found
 
 

@@ -40,9 +40,7 @@ def room_camera(width: int = 320, height: int = 240) -> Camera:
     return Camera.centred(FOCAL_RATIO * width, width, height)
 
 
-def synthetic_frames(
-    frames: int = 90, width: int = 320, height: int = 240, seed: int = 0
-) -> Iterator[SyntheticView]:
+def synthetic_frames(frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Iterator[SyntheticView]:
     """Frames of the room at 30 a second, one after another; the same seed gives the same pixels."""
     room, camera = Room(seed), room_camera(width, height)
     grid, fine = RayGrid(camera), RayGrid(camera.resized(2 * width, 2 * height))
@@ -61,9 +59,7 @@ def synthetic_frames(
         )
 
 
-def make_room_clip(
-    folder: Path, frames: int = 90, width: int = 320, height: int = 240, seed: int = 0
-) -> Path:
+def make_room_clip(folder: Path, frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Path:
     """Write the clip as a TUM-layout folder with depth, masks and poses. Raises OutputError."""
     try:
         for name in ("rgb", "depth", "mask"):

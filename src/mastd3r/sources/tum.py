@@ -61,9 +61,7 @@ class TumSource:
         for i in self._chosen:
             if not self._image(i).is_file():
                 row = self._rows[i]
-                raise InputError(
-                    f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}"
-                )
+                raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
         height, width = read_rgb(self._image(self._chosen[0])).shape[:2]
         self.size = (width, height)
         self._depth = self._associated("depth.txt")
@@ -125,9 +123,7 @@ class TumSource:
     def _units_per_metre(self) -> float:
         scale = self._number("depth_scale")
         if scale is None:
-            self._notes.put(
-                "scale", f"info.json tells no depth_scale: {TUM_DEPTH_SCALE:g} units a metre assumed"
-            )
+            self._notes.put("scale", f"info.json tells no depth_scale: {TUM_DEPTH_SCALE:g} units a metre assumed")
             return TUM_DEPTH_SCALE
         return scale
 

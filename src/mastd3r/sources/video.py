@@ -138,9 +138,7 @@ class VideoSource:
         aspect = self._contents.pixel_aspect
         width = round(frame.width * aspect)
         if width != frame.width:
-            self._notes.put(
-                "aspect", f"pixels are {aspect} as wide as high: stretched to {width}x{frame.height}"
-            )
+            self._notes.put("aspect", f"pixels are {aspect} as wide as high: stretched to {width}x{frame.height}")
             frame = frame.reformat(width=width, height=frame.height, format="rgb24")
         image: Array = frame.to_ndarray(format="rgb24")
         if self._turn != UPRIGHT:
@@ -218,17 +216,13 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             raise InputError(f"{path}: expected a video or a folder of images, got a single image")
         stream = next((s for s in container.streams.video if not _is_picture(s)), None)
         if stream is None:
-            raise InputError(
-                f"{path}: expected a video, got a {container.format.name} file without moving pictures"
-            )
+            raise InputError(f"{path}: expected a video, got a {container.format.name} file without moving pictures")
         yield container, stream
 
 
 def _is_picture(stream: Any) -> bool:
     """Cover art of a sound file, and text that the library would draw, are no video."""
-    return (
-        bool(stream.disposition & av.stream.Disposition.attached_pic) or stream.codec_context.name == "ansi"
-    )
+    return bool(stream.disposition & av.stream.Disposition.attached_pic) or stream.codec_context.name == "ansi"
 
 
 def _why_not(path: Path) -> str:
