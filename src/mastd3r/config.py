@@ -63,6 +63,7 @@ class GraphConfig:
     """Joint optimisation over keyframes."""
 
     bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
+    radial_keyframes: int = 12  # keyframes before the radial term is estimated
     neighbours: int = 6  # previous keyframes that a new one is matched with
     covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with
     window: int = 8  # keyframes that move in the windowed optimisation

@@ -215,7 +215,7 @@ class Slam:
     def _connect_both(self, i: int, j: int) -> None:
         grid_px = self.parts.grid_px
         if self.graph.initialised:
-            start, back = rigid_flow(self.graph, i, j, grid_px), rigid_flow(self.graph, j, i, grid_px)
+            start, back = rigid_flow(self.graph, i, j), rigid_flow(self.graph, j, i)
         elif (i, j - 1) in self._chain and (j - 1, j) in self._chain:
             start = chained_flow(self._chain[i, j - 1], self._chain[j - 1, j], grid_px)
             back = invert_flow(start, grid_px)
@@ -226,7 +226,8 @@ class Slam:
 
     def _connect(self, i: int, j: int, flow: Array) -> bool:
         ref, new = self.graph.keyframes[i], self.graph.keyframes[j]
-        pair = self.parts.provider.predict(ref.work, new.work, Guess(self.graph.camera(), flow=flow))
+        guess = Guess(self.graph.camera(), flow=flow, flow_is_near=self.graph.initialised)
+        pair = self.parts.provider.predict(ref.work, new.work, guess)
         if not self.graph.initialised:
             self._chain[i, j] = pair.flow
         return self.graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))

@@ -97,6 +97,7 @@ class Guess:
     ref_depth_info: Array | None = None  # (p,) 1/variance of it, unit pixel noise
     new_from_ref: Array | None = None  # (4, 4)
     flow: Array | None = None  # (h, w, 2) float32 ref -> new
+    flow_is_near: bool = False  # the flow comes from solved poses and depths: only the last pixels are searched
 
 
 @dataclass(frozen=True)

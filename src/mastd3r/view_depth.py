@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .dynamics.data import DynamicsInput
-from .geometry.se3 import inverse
+from .geometry.se3 import inverse, transform
 from .graph.depth import carried, filled, upsampled
 from .graph.keyframe_graph import KeyframeGraph
-from .pointmap.geometric import camera_flow, sample_own
+from .pointmap.geometric import sample_own
 from .types import WorkFrame
 
 Array = NDArray[Any]
@@ -73,17 +73,24 @@ def predicted_depth(
     return value, info
 
 
-def dense_inv_depth(graph: KeyframeGraph, kf_id: int) -> Array:
-    """(h, w) float32 inverse depth of a keyframe, holes filled from their neighbours."""
-    kf, block = graph.keyframes[kf_id], graph.blocks[kf_id]
-    values = filled(block.inv_depth, graph.depth_info(kf_id), kf.work.grid)
-    return upsampled(values, kf.work.grid, *graph.size)
+def rigid_flow(graph: KeyframeGraph, i: int, j: int) -> Array:
+    """(h, w, 2) flow i -> j that the graph's poses and depths predict; computed a cell, interpolated between."""
+    kf, block, camera = graph.keyframes[i], graph.blocks[i], graph.camera()
+    inv_depth = filled(block.inv_depth, graph.depth_info(i), kf.work.grid)
+    centres = cell_centres(kf.work.grid, *graph.size)
+    j_from_i = graph.blocks[j].cam_from_world @ inverse(block.cam_from_world)
+    points = transform(j_from_i, camera.rays(centres) / np.maximum(inv_depth, 1e-6)[:, None])
+    points[:, 2] = np.maximum(points[:, 2], 1e-2 / float(np.median(inv_depth)))
+    limit = 2.0 * max(graph.size)
+    flow = np.clip(camera.project(points) - centres, -limit, limit)
+    return cv2.merge([upsampled(flow[:, n], kf.work.grid, *graph.size) for n in (0, 1)])
 
 
-def rigid_flow(graph: KeyframeGraph, i: int, j: int, grid_px: Array) -> Array:
-    """(h, w, 2) flow i -> j that the graph's poses and depths predict."""
-    j_from_i = graph.blocks[j].cam_from_world @ inverse(graph.blocks[i].cam_from_world)
-    return camera_flow(dense_inv_depth(graph, i), j_from_i, graph.camera().pinhole, grid_px)
+def cell_centres(grid: tuple[int, int], width: int, height: int) -> Array:
+    """(p, 2) pixel centres of the cells, row by row."""
+    cell_px = min(width // grid[1], height // grid[0])
+    y, x = np.divmod(np.arange(grid[0] * grid[1]), grid[1])
+    return np.stack([x, y], 1) * cell_px + (cell_px - 1) / 2
 
 
 def dynamics_input(

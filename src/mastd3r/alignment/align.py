@@ -38,11 +38,11 @@ def align(
     pose, scale, stages = _raw(pair, matches, own, guess), 1.0, ["raw"]
     converged, iterations = True, 0
     if correction in ("coarse", "coarse-to-fine"):
-        coarse = resect(matches, guess) if own is None else icp(own.ref, own.new, own.weight, pose)
+        coarse = resect(matches, pose) if own is None else icp(own.ref, own.new, own.weight, pose)
         pose, converged, iterations = coarse.new_from_ref, coarse.converged, coarse.iterations
         stages.append("coarse")
         if own is not None:
-            scale = _scale_of(own, matches, pose)
+            scale = _scale_of(own, matches, guess)
             pose = icp(own.ref, scale * own.new, own.weight, pose).new_from_ref
             stages.append("scale")
     information = np.zeros((6, 6))
@@ -70,5 +70,7 @@ def _raw(pair: PairPrediction, matches: StaticMatches, own: OwnPoints | None, gu
     return solve_pose(matches, guess, kernel_px=50.0, iterations=10).new_from_ref
 
 
-def _scale_of(own: OwnPoints, matches: StaticMatches, pose: Array) -> float:
+def _scale_of(own: OwnPoints, matches: StaticMatches, guess: Array) -> float:
+    """Eq. (9) under the pose that the matches give: a rigid fit of the clouds hides the scale in its translation."""
+    pose = resect(matches, guess).new_from_ref
     return correct_scale(own.ref, own.new, matches.target, own.weight, pose)

@@ -5,41 +5,45 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+VariantKind = Literal["ours", "paper", "none"]
+
 
 @dataclass(frozen=True)
 class DynamicsConfig:
     """How P(moving) is found. Each evidence term can be switched off for an ablation."""
 
-    variant: Literal["ours", "paper", "none"] = "ours"  # paper: eq. (1)-(4) as printed; none: nothing moves
+    variant: VariantKind = "ours"  # paper: eq. (1)-(4) as printed; none: nothing moves
     base_rate: float = 0.1  # P(moving) where nothing is known
     use_depth: bool = True  # (a) the frame's own depth against the map's prediction
-    use_motion: bool = True  # (b) flow against the rigid flow of pose and depth
+    use_motion: bool = True  # (b) flow and grey values against the rigid scene of pose and depth
     use_semantic: bool = True  # (c) P(movable) of the frame
     use_time: bool = True  # (d) the last belief, carried along the flow
-    use_regions: bool = True  # joint smoothing of the evidence inside image edges
+    use_regions: bool = True  # pooling of the belief inside image edges
     memory: float = 0.85  # share of the carried log-odds that is kept from one frame to the next
-    evidence_gain: float = 0.6  # weight of one frame's log ratio; frames are not independent of each other
+    evidence_gain: float = 1.0  # weight of one frame's log ratios
     max_log_odds: float = 6.0  # clip of the accumulated evidence
     semantic_gain: float = 0.8  # weight of the map's log-odds
+    semantic_share: float = 0.3  # weight of our evidence where there is a map: it repeats from frame to frame
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
+    gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
     texture_noise: float = 4.0  # grey levels of noise that a texture has to beat
     motion_spread_px: float = 4.0  # 1 sigma of what a moving thing adds to the flow
     still_share: float = 0.1  # share of a moving thing's pixels that show no motion against the background
     outlier_share: float = 0.03  # share of static pixels whose flow is simply wrong
-    gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with
+    round_trip_px: float = 1.5  # forward-backward error at which the flow is half believed
+    pose_doubt_deg: float = 0.3  # 1 sigma of the pose error that the motion test may take out
     photo_noise: float = 5.0  # grey levels, 1 sigma of an aligned static pixel
     photo_shift_px: float = 0.4  # misalignment that a static pixel may show
-    photo_gain: float = 0.3  # weight of grey values that fit the rigid flow better than the measured one
-    clash_gain: float = 1.2  # weight of grey values that no static scene explains
+    photo_gain: float = 0.3  # weight of grey values that fit the rigid scene better than the flow
+    clash_gain: float = 1.2  # weight of grey values that nothing explains
     carry_mismatch: float = 10.0  # normalised grey mismatch from which the carried belief fades
-    round_trip_px: float = 1.5  # forward-backward error at which the flow is half believed
-    pose_doubt_deg: float = 0.3  # 1 sigma of the small pose error that the motion test may take out
     depth_noise_ratio: float = 0.03  # noise of the frame's own depth, as a share of it
-    region_px: float = 20.0  # radius of the joint smoothing
-    edge_px: int = 4
-    region_contrast: float = 30.0  # grey levels that count as an edge for it
-
+    region_px: float = 20.0  # reach of the pooling where there is no edge
+    region_contrast: float = 15.0  # grey levels that are as far as region_px
+    semantic_contrast: float = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
+    edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
+    edge_contrast: float = 30.0  # grey levels that it takes for an edge
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth
     tau_sigma: float = 2.5  # eq. (1) k
     window_px: int = 9  # eq. (1) window of the local variance

@@ -58,12 +58,13 @@ def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: fl
     ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): how far a pose may be off before it is doubted.
     """
     twist = np.zeros(6)
-    scale = 4 * noise_px
+    rows, target = jacobian.reshape(-1, 6).astype(np.float64), residual.reshape(-1)
+    scale, doubt = 4 * noise_px, np.diag(1 / prior_sigma**2)
     for _ in range(6):
-        left = residual - jacobian @ twist
+        left = (target - rows @ twist).reshape(-1, 2)
         w = weight / (1 + (left**2).sum(-1) / scale**2) / noise_px**2
-        normal = np.einsum("nki,n,nkj->ij", jacobian, w, jacobian) + np.diag(1 / prior_sigma**2)
-        twist = np.linalg.solve(normal, np.einsum("nki,n,nk->i", jacobian, w, residual))
+        weighted = rows * np.repeat(w, 2)[:, None]
+        twist = np.linalg.solve(rows.T @ weighted + doubt, weighted.T @ target)
         scale = max(0.6 * scale, 1.5 * noise_px)
     return twist
 
@@ -87,7 +88,7 @@ def flow_covariance(information: tuple[Array, Array, Array], base_px: float, wid
     floor = 1 / (widest_px * widest_px)
     xx, yy = xx + floor, yy + floor
     det = xx * yy - xy * xy
-    return np.stack([yy / det + base_px**2, -xy / det, xx / det + base_px**2], -1)
+    return cv2.merge([yy / det + base_px**2, -xy / det, xx / det + base_px**2])
 
 
 def _log_normal(residual: Array, cov: Array, extra: float) -> Array:
@@ -114,7 +115,10 @@ def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Arr
     return ratio
 
 
+_UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 squares
+
+
 def along_epipolar(cov: Array, slope: Array, inv_depth_sigma: Array) -> Array:
     """``cov`` (h, w, 3) grown by the depth's 1 sigma along ``slope`` (h, w, 2): the part a depth may explain."""
     dx, dy = slope[..., 0] * inv_depth_sigma, slope[..., 1] * inv_depth_sigma
-    return cov + np.stack([dx * dx, dx * dy, dy * dy], -1)
+    return cv2.add(cov, cv2.merge([dx * dx, dx * dy, dy * dy]))

@@ -47,8 +47,9 @@ def region_mean(guide: Array, value: Array, weight: Array, radius_px: float, edg
     A recursive filter in the domain transform of ``guide`` (Gastal, Oliveira 2011): an edge of ``edge`` grey levels
     is as long a way as ``radius_px`` pixels. Unlike a window it follows regions of any shape.
     """
-    step_x = 1 + radius_px / edge * np.abs(np.diff(guide, axis=1))
-    step_y = 1 + radius_px / edge * np.abs(np.diff(guide, axis=0))
+    layers = guide if guide.ndim == 3 else guide[..., None]
+    step_x = 1 + radius_px / edge * np.abs(np.diff(layers, axis=1)).sum(-1)
+    step_y = 1 + radius_px / edge * np.abs(np.diff(layers, axis=0)).sum(-1)
     both = np.stack([value * weight, weight], -1).astype(np.float32)
     rounds = 3
     for i in range(rounds):

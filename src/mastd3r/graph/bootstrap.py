@@ -74,7 +74,10 @@ def _attempt(graph: KeyframeGraph, lens: Lens) -> float | None:
         solve(near, edges, frozen, fixed=hold, iterations=15, kernel_px=4.0)
         _carry(graph, lens, k - 1, k)
         solve(near, graph.edges_among(done), frozen, fixed=frozenset([0]), iterations=6, kernel_px=2.0)
-    report = solve(graph.blocks, graph.edges, lens, fixed=frozenset([0]), iterations=25, kernel_px=1.0)
+    only_focal = Lens(lens.g, lens.prior, np.where(np.arange(4) == 0, lens.prior_info, np.inf))
+    report = solve(graph.blocks, graph.edges, only_focal, fixed=frozenset([0]), iterations=25, kernel_px=1.0)
+    lens.g = only_focal.g
+    log.info("  start tried: focal %.0f px, cost %.1f", np.exp(lens.g[0]), report.cost_last)
     return report.cost_last if np.isfinite(report.cost_last) else None
 
 

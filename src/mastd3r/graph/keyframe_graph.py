@@ -16,6 +16,9 @@ from ..types import Matches, State, WorkFrame
 from .bundle import Block, Edge, Lens, SolveReport, solve
 
 Array = NDArray[Any]
+PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 0.85, 0.25  # focal / longer side of phones, webcams, cars; 1 sigma of its log
+PRIOR_RADIAL_SIGMA = 0.05
+PRIOR_GAIN = 100.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
@@ -161,7 +164,10 @@ class KeyframeGraph:
         near = active | {e.j for e in edges}
         whole = len(near) == n and n <= size
         fixed = frozenset([0]) if whole else frozenset((near - active) | {min(active)})
-        lens = self.lens if n <= 2 * size or n % 4 == 0 else Lens(self.lens.g, self.lens.prior, np.full(4, np.inf))
+        free = self.lens.prior_info if n <= 2 * size or n % 4 == 0 else np.full(4, np.inf)
+        if n < self.config.radial_keyframes:  # too little seen to tell k from everything else
+            free = np.where(np.arange(4) == 1, np.inf, free)
+        lens = Lens(self.lens.g, self.lens.prior, free)
         report = solve(
             {k: self.blocks[k] for k in sorted(near)},
             edges,
@@ -245,6 +251,6 @@ def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int
         c = Camera(fx, fy, cx, cy, *full_size).resized(width, height)
         g = np.array([0.5 * np.log(c.fx_px * c.fy_px), 0.0, c.cx_px, c.cy_px])
         return Lens(g, g.copy(), np.full(4, np.inf))
-    g = np.array([np.log(float(max(width, height))), 0.0, (width - 1) / 2, (height - 1) / 2])
-    radial = 50 / 0.15**2 if camera.estimate_radial else np.inf
-    return Lens(g, g.copy(), np.array([1e-6, radial, np.inf, np.inf]))
+    g = np.array([np.log(PRIOR_FOCAL_RATIO * max(width, height)), 0.0, (width - 1) / 2, (height - 1) / 2])
+    radial = PRIOR_GAIN / PRIOR_RADIAL_SIGMA**2 if camera.estimate_radial else np.inf
+    return Lens(g, g.copy(), np.array([PRIOR_GAIN / PRIOR_FOCAL_SIGMA**2, radial, np.inf, np.inf]))

@@ -28,6 +28,7 @@ class FlowMatcher:
         self.width, self.height = width, height
         self.tolerance_px = tolerance_px
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+        self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self._grid = np.stack([x, y], -1)
         self._lk: dict[str, Any] = {
@@ -35,12 +36,12 @@ class FlowMatcher:
             "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.01),
         }
 
-    def dense(self, ref: Array, new: Array, start: Array | None = None) -> Array:
+    def dense(self, ref: Array, new: Array, start: Array | None = None, *, fast: bool = False) -> Array:
         """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched."""
         if start is None:
             return self._dis.calc(ref, new, None)
         warped = self.warp(new, start)
-        rest = self._dis.calc(ref, warped, None)
+        rest = (self._fast if fast else self._dis).calc(ref, warped, None)
         moved = cv2.remap(start, self._grid + rest, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return moved + rest
 
@@ -48,9 +49,14 @@ class FlowMatcher:
         """``new`` seen through a flow ref -> new, (h, w)."""
         return cv2.remap(new, self._grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    def match(self, ref: Array, new: Array, px: Array, start: Array | None = None) -> FlowResult:
-        """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward."""
-        flow = self.dense(ref, new, start)
+    def match(
+        self, ref: Array, new: Array, px: Array, start: Array | None = None, *, near: bool = False
+    ) -> FlowResult:
+        """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward.
+
+        ``near``: the start is within a few pixels already, so a quick dense search will do.
+        """
+        flow = self.dense(ref, new, start, fast=near)
         target, weight = self.refine(ref, new, px, flow)
         return FlowResult(target, weight, flow)
 

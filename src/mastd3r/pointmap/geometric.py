@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.camera import Camera
-from ..geometry.se3 import transform
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
 from .flow import FlowMatcher, corner_grid
 
@@ -49,7 +48,7 @@ class GeometricPointmaps:
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
         """Match ref's pixels in new; points by ref's depth where it is known, by triangulation otherwise."""
-        found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow)
+        found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow, near=guess.flow_is_near)
         matches = Matches(ref.px, found.target, found.weight * ref.texture)
         rays = guess.camera.rays(ref.px)
         ref_map = _known_points(ref.px, rays, guess)
@@ -130,19 +129,3 @@ def sample_own(frame: WorkFrame, px: Array) -> Array:
     x = np.clip(np.round(px[:, 0]).astype(int), 0, own.shape[1] - 1)
     y = np.clip(np.round(px[:, 1]).astype(int), 0, own.shape[0] - 1)
     return smooth[y, x].astype(float)
-
-
-def camera_flow(inv_depth: Array, new_from_ref: Array, camera: Camera, grid_px: Array) -> Array:
-    """Flow (h, w, 2) float32 of a static scene with dense inverse depth (h, w) under a camera motion."""
-    rays = camera.rays(grid_px) if camera.k1 != 0.0 else _fast_rays(camera, grid_px)
-    points = transform(new_from_ref, rays / np.maximum(inv_depth, 1e-6)[..., None])
-    z = points[..., 2:]
-    points = np.concatenate([points[..., :2], np.where(z > 1e-6, np.maximum(z, 1e-6), 1e-6)], -1)
-    flow = camera.project(points) - grid_px
-    limit = 2.0 * max(camera.width, camera.height)
-    return np.clip(flow, -limit, limit).astype(np.float32)
-
-
-def _fast_rays(camera: Camera, grid_px: Array) -> Array:
-    xy = (grid_px - np.array([camera.cx_px, camera.cy_px])) / np.array([camera.fx_px, camera.fy_px])
-    return np.concatenate([xy, np.ones_like(xy[..., :1])], -1)

@@ -1,0 +1,268 @@
+"""The rules of docs/architecture.md, read from the code itself; and what the documents say of files and options."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from mastd3r import __version__
+from mastd3r.cli_commands import _parser
+from mastd3r.config import Config, with_override
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "mastd3r"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+WRITTEN = [*MODULES, *sorted((ROOT / "tests").rglob("*.py")), *sorted((ROOT / "benchmarks").rglob("*.py"))]
+WRITTEN += sorted((ROOT / "docs").glob("*.py"))
+
+MAX_FILE_LINES, MAX_FUNCTION_LINES = 400, 60
+STAGES = {"sources", "pointmap", "dynamics", "alignment", "graph", "mapping", "evaluation", "export"}
+CONTRACTS = {"types", "config", "errors"}
+
+# What may be imported, from the bottom up. A module sees the entries named here, nothing else of the package.
+LAYERS: dict[str, set[str]] = {
+    "errors": set(),
+    "geometry": {"errors"},
+    "types": {"geometry", "errors"},
+    "config": {"errors"},
+    **{stage: {"geometry", *CONTRACTS} for stage in STAGES},
+    "progress": set(),
+    "lens_view": {"geometry"},
+    "view_depth": {"geometry", "types", *STAGES},
+    "parts": {*CONTRACTS, *STAGES},
+    "finish": {"geometry", *CONTRACTS, *STAGES},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
+    "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish"},
+    "run": {
+        "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress",
+    },
+    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run"},
+    "cli": {"errors", "cli_commands"},
+    "__main__": {"cli"},
+    "": set(),
+}  # fmt: skip
+
+# (importing module, imported module): reason
+EXCEPTIONS = {
+    ("config", "dynamics.config"): "the mask's options stand with the mask; config only joins them",
+    ("export.machine", ""): "the version number of the package goes into run.json",
+}
+
+HEAVY = {  # package: who may import it
+    "torch": {"mapping"},
+    "gsplat": {"mapping"},
+    "av": {"sources"},
+    "numba": {"geometry", "dynamics", "mapping"},
+    "rich": {"progress", "cli_commands"},
+}
+NAMES_A_DEVICE = {"mapping.rasterise"}
+READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
+PASSES_TRUTH_ON = {"run", "cli_commands"}
+EXITS = {"cli", "__main__"}
+
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
+GENERATED = {"docs/picture.png", "docs/results.md"}  # made by a command after the code is there
+
+
+def dotted(path: Path) -> str:
+    """ "graph.bundle" for src/mastd3r/graph/bundle.py; "" for the package itself."""
+    parts = list(path.relative_to(PACKAGE).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def owner(module: str) -> str:
+    """The stage folder or top-level module that a module belongs to."""
+    return module.partition(".")[0]
+
+
+@cache
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), str(path))
+
+
+def own_imports(path: Path) -> Iterator[tuple[str, int]]:
+    """(module of this package, line) of every import, relative or absolute, wherever it stands."""
+    package = list(path.relative_to(PACKAGE).parent.parts)
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            for name in node.names:
+                if name.name.partition(".")[0] == "mastd3r":
+                    yield name.name.partition(".")[2], node.lineno
+        elif isinstance(node, ast.ImportFrom):
+            if node.level:
+                base = [*package[: len(package) - node.level + 1], *(node.module or "").split(".")]
+            elif (node.module or "").partition(".")[0] == "mastd3r":
+                base = (node.module or "").split(".")[1:]
+            else:
+                continue
+            base = [part for part in base if part]
+            for name in node.names:
+                target = PACKAGE.joinpath(*base, name.name)
+                is_module = target.with_suffix(".py").is_file() or target.is_dir()
+                yield ".".join([*base, name.name] if is_module else base), node.lineno
+
+
+def foreign_imports(path: Path) -> Iterator[tuple[str, int]]:
+    """(top-level package, line) of every absolute import."""
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from ((name.name.partition(".")[0], node.lineno) for name in node.names)
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            yield (node.module or "").partition(".")[0], node.lineno
+
+
+def test_every_module_has_a_layer() -> None:
+    assert {owner(dotted(p)) for p in MODULES} == set(LAYERS)
+
+
+def test_imports_keep_the_layers() -> None:
+    wrong, used = [], set()
+    for path in MODULES:
+        module = dotted(path)
+        for imported, line in own_imports(path):
+            if owner(imported) == owner(module) and module:
+                continue
+            if (module, imported) in EXCEPTIONS:
+                used.add((module, imported))
+            elif owner(imported) not in LAYERS[owner(module)]:
+                wrong.append(f"{path.relative_to(ROOT)}:{line} imports mastd3r.{imported}")
+    assert not wrong
+    assert used == set(EXCEPTIONS), "an exception that nothing needs any more"
+
+
+def test_stages_do_not_see_one_another() -> None:
+    for stage in STAGES:
+        assert not LAYERS[stage] & (STAGES - {stage})
+    assert all(importer == "config" for importer, imported in EXCEPTIONS if owner(imported) in STAGES)
+
+
+def test_heavy_packages_stay_where_they_are_needed() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line} imports {package}"
+        for path in MODULES
+        for package, line in foreign_imports(path)
+        if package in HEAVY and owner(dotted(path)) not in HEAVY[package]
+    ]
+    assert not wrong
+
+
+def test_files_are_short() -> None:
+    lengths = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in WRITTEN}
+    assert {name: n for name, n in lengths.items() if n > MAX_FILE_LINES} == {}
+
+
+def test_functions_are_short() -> None:
+    long = {
+        f"{path.relative_to(ROOT)}:{node.name}": (node.end_lineno or 0) - node.lineno + 1
+        for path in WRITTEN
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (node.end_lineno or 0) - node.lineno + 1 > MAX_FUNCTION_LINES
+    }
+    assert long == {}
+
+
+def test_only_the_command_line_prints_and_exits() -> None:
+    wrong = []
+    for path in MODULES:
+        module = dotted(path)
+        for node in ast.walk(tree(path)):
+            if not isinstance(node, ast.Call):
+                continue
+            called = ast.unparse(node.func)
+            if called == "print" and not path.name.startswith("cli"):
+                wrong.append(f"{path.relative_to(ROOT)}:{node.lineno} prints")
+            if called in ("exit", "quit", "sys.exit", "os._exit") and module not in EXITS:
+                wrong.append(f"{path.relative_to(ROOT)}:{node.lineno} exits")
+    assert not wrong
+
+
+def test_no_error_is_swallowed() -> None:
+    wrong = []
+    for path in WRITTEN:
+        for node in ast.walk(tree(path)):
+            if not isinstance(node, ast.ExceptHandler):
+                continue
+            kinds = {n.id for n in ast.walk(node.type) if isinstance(n, ast.Name)} if node.type else {""}
+            cleans_up = kinds == {"BaseException"} and isinstance(node.body[-1], ast.Raise)
+            if kinds & {"", "Exception", "BaseException"} and not cleans_up:
+                wrong.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert not wrong
+
+
+def test_one_file_chooses_the_device() -> None:
+    naming = {dotted(p) for p in MODULES if "cuda" in p.read_text(encoding="utf-8")}
+    assert naming == NAMES_A_DEVICE
+
+
+def test_truth_is_read_by_the_evaluation_only() -> None:
+    wrong = []
+    for path in MODULES:
+        module = dotted(path)
+        if owner(module) in READS_TRUTH:
+            continue
+        allowed = _truth_calls_passed_on(path) if module in PASSES_TRUTH_ON else set()
+        for node in ast.walk(tree(path)):
+            name = {ast.Name: "id", ast.Attribute: "attr", ast.alias: "name"}.get(type(node))
+            if name is None or node in allowed:
+                continue
+            called = getattr(node, name)
+            if called in ("Truth", "moving_files") or (called == "truth" and _is_called(path, node)):
+                wrong.append(f"{path.relative_to(ROOT)}:{node.lineno} reads truth")
+    assert not wrong
+
+
+def _truth_calls_passed_on(path: Path) -> set[ast.AST]:
+    """The ``x.truth`` of every ``evaluate(..., x.truth(), ...)``."""
+    found: set[ast.AST] = set()
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "evaluate":
+            found |= {a.func for a in node.args if isinstance(a, ast.Call) and isinstance(a.func, ast.Attribute)}
+    return found
+
+
+def _is_called(path: Path, attribute: ast.AST) -> bool:
+    return any(isinstance(node, ast.Call) and node.func is attribute for node in ast.walk(tree(path)))
+
+
+@pytest.mark.parametrize("module", [dotted(p) for p in MODULES if p.name != "__main__.py"])
+def test_every_module_imports_and_says_what_it_is(module: str) -> None:
+    loaded = importlib.import_module(f"mastd3r.{module}".rstrip("."))
+    assert loaded.__doc__
+
+
+def test_the_package_runs_as_a_module() -> None:
+    words = [sys.executable, "-m", "mastd3r", "--version"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == __version__
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: p.name)
+def test_links_of_documents_lead_somewhere(path: Path) -> None:
+    links = re.findall(r"\]\(([^)#:]+)\)", path.read_text(encoding="utf-8"))
+    targets = {(path.parent / link).resolve().relative_to(ROOT).as_posix() for link in links}
+    assert sorted(t for t in targets - GENERATED if not (ROOT / t).exists()) == []
+
+
+def test_options_in_the_readme_exist() -> None:
+    parser, known = _parser(), set()
+    for command in next(a.choices for a in parser._actions if isinstance(a.choices, dict)).values():
+        known |= {word for action in command._actions for word in action.option_strings}
+    named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", (ROOT / "README.md").read_text(encoding="utf-8")))
+    assert named and sorted(named - known) == []
+
+
+def test_settings_in_the_documents_exist() -> None:
+    text = "\n".join(p.read_text(encoding="utf-8") for p in DOCUMENTS)
+    settings = set(re.findall(r"\b((?:source|camera|tracking|graph|dynamics|mapping)\.\w+=\w+)", text))
+    assert settings
+    for setting in settings:
+        with_override(Config(), setting)

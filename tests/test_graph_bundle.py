@@ -1,0 +1,174 @@
+"""The joint optimisation on keyframes of which everything is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
+from mastd3r.geometry.sim3 import procrustes
+from mastd3r.graph.bundle import Block, Edge, Lens, solve
+
+Array = NDArray[Any]
+VIEWS = 5
+
+
+def edges_of(scene: Any, noise_px: float = 0.0, outliers: float = 0.0, seed: int = 5) -> list[Edge]:
+    rng = np.random.default_rng(seed)
+    edges = []
+    for i in range(VIEWS):
+        for j in range(VIEWS):
+            if i == j:
+                continue
+            m = scene.matches(i, j, noise_px, seed)
+            wrong = rng.random(len(scene.px)) < outliers
+            target = m.new_px + wrong[:, None] * rng.uniform(-40, 40, m.new_px.shape)
+            edges.append(Edge(i, j, target, m.weight))
+    return edges
+
+
+def blocks_of(scene: Any, pose_noise: float = 0.02, depth_noise: float = 0.15) -> dict[int, Block]:
+    """True blocks, disturbed; the first pose is exact and the depth priors are weak and wrong."""
+    rng = np.random.default_rng(6)
+    blocks = {}
+    for k in range(VIEWS):
+        pose = scene.cam_from_world[k] @ inverse(scene.cam_from_world[0])
+        if k:
+            pose = se3_exp(rng.normal(0, pose_noise, 6)) @ pose
+        inv_depth = np.exp(rng.normal(0, depth_noise, len(scene.px))) / scene.depth(k)
+        blocks[k] = Block(scene.px, inv_depth, inv_depth.copy(), np.full(len(scene.px), 1e-2), pose)
+    return blocks
+
+
+def lens_of(scene: Any, focal_ratio: float = 1.0, k: float = 0.0, free: bool = True) -> Lens:
+    g = np.array([np.log(focal_ratio * scene.focal_px), k, *scene.lens[2:]])
+    info = np.array([1e-6, 1.0, np.inf, np.inf]) if free else np.full(4, np.inf)
+    return Lens(g, g.copy(), info)
+
+
+def check(
+    scene: Any, blocks: dict[int, Block], position_ratio: float, turn_rad: float, depth_ratio: float
+) -> float:
+    """Poses and depths against the truth after Sim(3); the limits are of the path and the depth. The scale."""
+    found = np.stack([inverse(blocks[k].cam_from_world) for k in range(VIEWS)])
+    truth = np.stack([scene.cam_from_world[0] @ inverse(scene.cam_from_world[k]) for k in range(VIEWS)])
+    path = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    fit = procrustes(truth[:, :3, 3], found[:, :3, 3], np.ones(VIEWS), with_scale=True)
+    off = np.linalg.norm(fit.apply(found[:, :3, 3]) - truth[:, :3, 3], axis=1)
+    assert off.max() < position_ratio * path
+    for k in range(VIEWS):
+        turn = se3_log(inverse(truth[k]) @ found[k])[3:]
+        assert np.linalg.norm(turn) < turn_rad
+        seen = blocks[k].depth_info > 1
+        assert seen.mean() > 0.5
+        ratio = fit.scale / blocks[k].inv_depth[seen] / scene.depth(k)[seen]
+        assert np.median(np.abs(ratio - 1)) < depth_ratio
+    return fit.scale
+
+
+def test_exact_matches_give_the_exact_answer(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2)
+    blocks, lens = blocks_of(scene), lens_of(scene, free=False)
+    for b in blocks.values():
+        b.prior_info = np.full(len(scene.px), 1e-9)
+    report = solve(blocks, edges_of(scene), lens, fixed=frozenset([0]), iterations=60, tolerance=1e-12)
+    check(scene, blocks, 1e-4, 1e-4, 1e-3)
+    assert report.cost_last < 1e-6 * report.cost_first and report.focal_sigma_ratio == np.inf
+
+
+@pytest.mark.parametrize("focal_error", [0.8, 1.2])
+@pytest.mark.parametrize("k", [0.0, -0.06])
+def test_unknown_lens_and_noise(exact_scene: Callable[..., Any], focal_error: float, k: float) -> None:
+    """0.2 px of noise, a focal length 20 % off, an unknown radial term: all of it comes back."""
+    scene = exact_scene(VIEWS, step=0.2, k=k, cell_px=12)
+    blocks, lens = blocks_of(scene), lens_of(scene, focal_error)
+    report = solve(blocks, edges_of(scene, 0.2), lens, fixed=frozenset([0]), iterations=60)
+    assert np.exp(lens.g[0]) == pytest.approx(scene.focal_px, rel=0.01)
+    assert lens.g[1] == pytest.approx(k, abs=0.015)
+    assert (lens.g[2:] == scene.lens[2:]).all()
+    check(scene, blocks, 0.01, 0.005, 0.02)
+    assert report.converged and report.cost_last < 0.05 * report.cost_first
+    assert 0 < report.focal_sigma_ratio < 0.05
+
+
+def test_a_fifth_of_the_matches_may_be_wrong(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2, cell_px=12)
+    blocks, lens = blocks_of(scene), lens_of(scene, 1.1)
+    edges = edges_of(scene, 0.2, outliers=0.2)
+    solve(blocks, edges, lens, fixed=frozenset([0]), iterations=30, kernel_px=2.0)
+    solve(blocks, edges, lens, fixed=frozenset([0]), iterations=40, kernel_px=0.5)
+    assert np.exp(lens.g[0]) == pytest.approx(scene.focal_px, rel=0.01)
+    check(scene, blocks, 0.02, 0.01, 0.03)
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.2])
+def test_noise_does_not_pull_the_lens_one_way(exact_scene: Callable[..., Any], outliers: float) -> None:
+    """The mean over eight draws of the noise is the truth: a cost that falls with k alone would not pass."""
+    scene = exact_scene(VIEWS, step=0.3)
+    focal, radial = [], []
+    for seed in range(8):
+        blocks, lens = blocks_of(scene), lens_of(scene, 1.1)
+        edges = edges_of(scene, 0.2, outliers, seed)
+        solve(blocks, edges, lens, fixed=frozenset([0]), iterations=25, kernel_px=2.0)
+        solve(blocks, edges, lens, fixed=frozenset([0]), iterations=25, kernel_px=0.5)
+        focal.append(np.exp(lens.g[0]) / scene.focal_px - 1)
+        radial.append(lens.g[1])
+    assert abs(np.mean(focal)) < 0.003 and abs(np.mean(radial)) < 0.002
+
+
+def test_fixed_poses_stay_to_the_last_bit(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2)
+    blocks, lens = blocks_of(scene), lens_of(scene)
+    before = {k: b.cam_from_world.copy() for k, b in blocks.items()}
+    solve(blocks, edges_of(scene, 0.2), lens, fixed=frozenset([0, 2, 3]), iterations=5)
+    for k in range(VIEWS):
+        same = (blocks[k].cam_from_world == before[k]).all()
+        assert same == (k in (0, 2, 3))
+        assert (blocks[k].inv_depth > 0).all()
+
+
+def test_fixed_intrinsics_stay(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2)
+    lens = lens_of(scene, 1.2, free=False)
+    before = lens.g.copy()
+    solve(blocks_of(scene), edges_of(scene, 0.2), lens, fixed=frozenset([0]), iterations=5)
+    assert (lens.g == before).all()
+    half = Lens(before.copy(), before, np.array([1e-6, np.inf, np.inf, np.inf]))
+    solve(blocks_of(scene), edges_of(scene, 0.2), half, fixed=frozenset([0]), iterations=15)
+    assert half.g[0] != before[0] and (half.g[1:] == before[1:]).all()
+
+
+def test_measured_depths_fix_the_scale(exact_scene: Callable[..., Any]) -> None:
+    """Depth priors of a sensor hold the metric scale, which matches alone leave free."""
+    scene = exact_scene(VIEWS, step=0.2)
+    blocks = blocks_of(scene)
+    for k, b in blocks.items():
+        b.prior_depth = 1 / scene.depth(k)
+        b.prior_info = 1 / (0.02 * b.prior_depth) ** 2
+    solve(blocks, edges_of(scene, 0.2), lens_of(scene), fixed=frozenset([0]), iterations=40)
+    assert check(scene, blocks, 0.01, 0.005, 0.02) == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_cost_never_rises(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2)
+    blocks, lens, edges = blocks_of(scene), lens_of(scene, 0.8), edges_of(scene, 0.2, outliers=0.1)
+    costs = []
+    for _ in range(12):
+        report = solve(blocks, edges, lens, fixed=frozenset([0]), iterations=1)
+        costs += [report.cost_first, report.cost_last]
+    assert all(b <= a * (1 + 1e-6) for a, b in zip(costs, costs[1:], strict=False))
+
+
+def test_a_keyframe_without_matches_stays_where_it_is(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS, step=0.2)
+    blocks = blocks_of(scene)
+    before, depth = blocks[4].cam_from_world.copy(), blocks[4].inv_depth.copy()
+    edges = [e for e in edges_of(scene, 0.2) if 4 not in (e.i, e.j)]
+    report = solve(blocks, edges, lens_of(scene), fixed=frozenset([0]), iterations=20)
+    np.testing.assert_allclose(blocks[4].cam_from_world, before, atol=1e-12)
+    np.testing.assert_allclose(blocks[4].inv_depth, depth)
+    assert np.isfinite(report.cost_last)

@@ -1,0 +1,179 @@
+"""After the last frame: final poses, lost frames, the static cloud."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.config import CameraConfig, Config, GraphConfig
+from mastd3r.errors import InputError
+from mastd3r.finish import final_frames, finish_graph, static_cloud, trajectory_of
+from mastd3r.geometry.se3 import interpolate, inverse, se3_exp, se3_log
+from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
+
+Array = NDArray[Any]
+KEYFRAMES = (0, 6, 12)
+
+
+def world_from(scene: Any, k: int) -> Array:
+    return scene.cam_from_world[0] @ inverse(scene.cam_from_world[k])
+
+
+def tracked_graph(scene: Any, lost: set[int], noise_px: float = 0.2, count: int = 13) -> KeyframeGraph:
+    """Frames 0 … count - 1 of the scene; 0, 6, 12 are keyframes with true depths; guesses are a little off."""
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), *size, size))
+    graph.lens.g = scene.lens.copy()
+    graph.initialised = True
+    p, rng = len(scene.px), np.random.default_rng(0)
+    nothing_moves = np.zeros((scene.height, scene.width))
+    for k in range(count):
+        work = scene.work_frame(k)
+        if k in KEYFRAMES:
+            kf = graph.add_keyframe(
+                work, np.ones(p), nothing_moves, inverse(world_from(scene, k)), 1 / scene.depth(k), np.ones(p)
+            )
+            graph.blocks[kf.id].depth_info = np.full(p, 1e6)
+            graph.record(work, kf.id, np.eye(4), "tracked", None, np.zeros(0))
+            graph.replace_last_by_keyframe(kf)
+            continue
+        kf_id = graph.latest.id
+        if k in lost:
+            graph.record(work, kf_id, np.eye(4), "lost", None, np.zeros(0))
+            continue
+        m = scene.matches(KEYFRAMES[kf_id], k, noise_px)
+        guess = se3_exp(rng.normal(0, 0.01, 6)) @ scene.j_from_i(KEYFRAMES[kf_id], k)
+        graph.record(work, kf_id, guess, "tracked", m, m.weight)
+    return graph
+
+
+@pytest.fixture(scope="module")
+def scene(exact_scene: Callable[..., Any]) -> Any:
+    return exact_scene(13, step=0.05)
+
+
+def test_every_frame_is_refined_from_its_own_matches(scene: Any) -> None:
+    frames = final_frames(tracked_graph(scene, set()))
+    assert [f.state for f in frames] == ["tracked"] * 13
+    for k, f in enumerate(frames):
+        assert np.linalg.norm(se3_log(f.world_from_cam @ inverse(world_from(scene, k)))) < 0.005
+    trajectory = trajectory_of(frames)
+    assert trajectory.is_keyframe.tolist() == [k in KEYFRAMES for k in range(13)]
+    np.testing.assert_allclose(trajectory.timestamps_s, np.arange(13) / 30)
+    assert trajectory.keyframes().world_from_cam.shape == (3, 4, 4)
+
+
+def test_lost_frames_are_bridged_between_tracked_ones(scene: Any) -> None:
+    frames = final_frames(tracked_graph(scene, {3, 4, 5, 8}))
+    assert [n for n, f in enumerate(frames) if f.state == "interpolated"] == [3, 4, 5, 8]
+    a, b = frames[2].world_from_cam, frames[6].world_from_cam
+    for n in (3, 4, 5):
+        np.testing.assert_allclose(frames[n].world_from_cam, interpolate(a, b, (n - 2) / 4), atol=1e-9)
+    middle = 0.5 * (frames[7].world_from_cam[:3, 3] + frames[9].world_from_cam[:3, 3])
+    np.testing.assert_allclose(frames[8].world_from_cam[:3, 3], middle, atol=1e-9)
+
+
+def test_frames_lost_at_the_ends_stand_still(scene: Any) -> None:
+    frames = final_frames(tracked_graph(scene, {10, 11}, count=12))
+    assert [f.state for f in frames[-3:]] == ["tracked", "interpolated", "interpolated"]
+    for f in frames[-2:]:
+        np.testing.assert_array_equal(f.world_from_cam, frames[9].world_from_cam)
+    graph = tracked_graph(scene, set())
+    for r in graph.records[:2]:
+        r.state, r.is_keyframe = "lost", False
+    first = final_frames(graph)
+    np.testing.assert_array_equal(first[0].world_from_cam, first[2].world_from_cam)
+    assert np.isfinite(trajectory_of(first).world_from_cam).all()
+
+
+def test_a_run_that_never_saw_anything_has_no_pose(scene: Any) -> None:
+    graph = tracked_graph(scene, set(), count=3)
+    for r in graph.records:
+        r.state, r.is_keyframe = "lost", False
+    frames = final_frames(graph)
+    assert all(f.state == "lost" and np.isnan(f.world_from_cam).all() for f in frames)
+    assert trajectory_of([]).world_from_cam.shape == (0, 4, 4)
+
+
+def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), *size, size))
+    p = len(scene.px)
+    graph.add_keyframe(scene.work_frame(0), np.ones(p), np.zeros((240, 320)), np.eye(4), np.ones(p), np.ones(p))
+    with pytest.raises(InputError, match=r"camera never moves enough: expected .* 8% .*, got 1 view"):
+        finish_graph(graph, Config())
+
+
+def cloud_inputs(graph: KeyframeGraph, scene: Any) -> tuple[dict[int, Array], dict[int, Array]]:
+    rng = np.random.default_rng(0)
+    p = len(scene.px)
+    colors = {k: rng.integers(0, 255, (p, 3)).astype(np.uint8) for k in graph.blocks}
+    return colors, {k: np.zeros(p) for k in graph.blocks}
+
+
+def test_the_cloud_lies_on_the_surface(scene: Any) -> None:
+    graph = tracked_graph(scene, set())
+    colors, moving = cloud_inputs(graph, scene)
+    cloud = static_cloud(graph, colors, moving)
+    p = len(scene.px)
+    assert len(cloud.points_world) == 3 * p
+    truth = np.concatenate(
+        [scene.points(k) @ world_from(scene, k)[:3, :3].T + world_from(scene, k)[:3, 3] for k in KEYFRAMES]
+    )
+    np.testing.assert_allclose(cloud.points_world, truth, rtol=0.01, atol=0.01)
+    np.testing.assert_array_equal(cloud.colors, np.concatenate([colors[k] for k in range(3)]))
+    np.testing.assert_array_equal(cloud.kf_id, np.repeat([0, 1, 2], p))
+    depth = np.concatenate([scene.depth(k) for k in KEYFRAMES])
+    np.testing.assert_allclose(cloud.spacing, depth * 16 / scene.focal_px, rtol=0.02)
+    assert cloud.confidence.min() > 0.9
+
+
+def test_moving_points_are_pruned_and_doubtful_ones_count_less(scene: Any) -> None:
+    graph = tracked_graph(scene, set())
+    colors, moving = cloud_inputs(graph, scene)
+    whole = static_cloud(graph, colors, moving)
+    p = len(scene.px)
+    moving[1][: p // 3] = 0.9
+    moving[2][:] = 0.3
+    cloud = static_cloud(graph, colors, moving)
+    assert (cloud.kf_id == 1).sum() == p - p // 3 and (cloud.kf_id == 0).sum() == p
+    np.testing.assert_array_equal(cloud.colors[cloud.kf_id == 1], colors[1][p // 3 :])
+    np.testing.assert_allclose(
+        cloud.confidence[cloud.kf_id == 2], 0.7 * whole.confidence[whole.kf_id == 2], rtol=1e-4
+    )
+
+
+def test_points_nobody_has_measured_are_pruned(scene: Any) -> None:
+    graph = tracked_graph(scene, set())
+    for b in graph.blocks.values():
+        b.depth_info, b.prior_info = np.zeros(len(b.px)), np.full(len(b.px), 1e-6)
+    colors, moving = cloud_inputs(graph, scene)
+    assert len(static_cloud(graph, colors, moving).points_world) == 0
+    empty = static_cloud(graph, {}, {})
+    assert empty.points_world.shape == (0, 3) and empty.kf_id.dtype == np.int32
+
+
+def test_finishing_improves_disturbed_keyframes(scene: Any) -> None:
+    graph = tracked_graph(scene, set())
+    for i, a in enumerate(KEYFRAMES):
+        for j, b in enumerate(KEYFRAMES):
+            if i != j:
+                graph.connect(i, j, scene.matches(a, b, 0.2), np.ones(len(scene.px)))
+    rng = np.random.default_rng(1)
+    for k in (1, 2):
+        graph.blocks[k].cam_from_world = se3_exp(rng.normal(0, 0.02, 6)) @ graph.blocks[k].cam_from_world
+    for b in graph.blocks.values():
+        b.depth_info = np.zeros(0)
+        b.prior_info = np.full(len(b.px), 1e-2)
+    config = replace(Config(), graph=replace(GraphConfig(), final_iterations=30))
+    finish_graph(graph, config)
+    report = graph.last_report
+    assert report is not None and report.cost_last <= report.cost_first
+    turn = se3_log(graph.world_from_cam(2) @ inverse(world_from(scene, 12)))[3:]
+    assert np.linalg.norm(turn) < 0.01
+    np.testing.assert_allclose(graph.world_from_cam(0), np.eye(4), atol=1e-12)

@@ -1,0 +1,315 @@
+"""The keyframe graph: start from nothing, scale, lens, dense depths, what sees the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.config import CameraConfig, GraphConfig
+from mastd3r.geometry.camera import Camera
+from mastd3r.geometry.reprojection import host_cost
+from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
+from mastd3r.geometry.sim3 import procrustes
+from mastd3r.graph.bootstrap import bootstrap
+from mastd3r.graph.depth import carried, filled, trust, upsampled
+from mastd3r.graph.keyframe_graph import (
+    KeyframeGraph,
+    camera_of,
+    lens_for,
+    radial_from_undistortion,
+)
+from mastd3r.graph.places import PlaceIndex, covisible, overlap
+from mastd3r.sources.synthetic import SyntheticView
+from mastd3r.types import Matches
+
+Array = NDArray[Any]
+
+
+def graph_of(
+    scene: Any, views: int, *, noise_px: float = 0.0, solved: bool = False, camera: CameraConfig | None = None
+) -> KeyframeGraph:
+    """A graph with matches between all views; ``solved``: with true poses and depths, otherwise with none."""
+    camera = camera or CameraConfig()
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(GraphConfig(), camera, lens_for(camera, *size, size))
+    p = len(scene.px)
+    nothing_moves = np.zeros((scene.height, scene.width))
+    for k in range(views):
+        pose = scene.cam_from_world[k] @ inverse(scene.cam_from_world[0]) if solved else np.eye(4)
+        depth = 1 / scene.depth(k) if solved else np.ones(p)
+        graph.add_keyframe(scene.work_frame(k), np.ones(p), nothing_moves, pose, depth, np.full(p, 1e-2))
+    for i in range(views):
+        for j in range(views):
+            if i != j:
+                graph.connect(i, j, scene.matches(i, j, noise_px), np.ones(p))
+    if solved:
+        graph.lens.g = scene.lens.copy()
+        graph.initialised = True
+        for k in range(views):
+            graph.blocks[k].depth_info = np.full(p, 1e4)
+    return graph
+
+
+def costs(graph: KeyframeGraph) -> Array:
+    out = []
+    for e in graph.edges:
+        a, b = graph.blocks[e.i], graph.blocks[e.j]
+        j_from_i = (b.cam_from_world @ inverse(a.cam_from_world))[None]
+        out.append(
+            host_cost(a.px, a.inv_depth, e.target[None], e.weight[None], j_from_i, graph.lens.g, 1.0)[0]
+        )
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("focal_px", "k"), [(200.0, 0.0), (260.0, -0.05), (420.0, 0.0)])
+def test_bootstrap_from_nothing(exact_scene: Callable[..., Any], focal_px: float, k: float) -> None:
+    """Five keyframes, 0.2 px of noise, nothing known of lens or depth."""
+    scene = exact_scene(5, step=0.2, focal_px=focal_px, k=k)
+    graph = graph_of(scene, 5, noise_px=0.2)
+    assert bootstrap(graph) and graph.initialised
+    report = graph.solve_all(40, 0.5)
+    assert np.exp(graph.lens.g[0]) == pytest.approx(focal_px, rel=0.02)
+    found = np.stack([graph.world_from_cam(i) for i in range(5)])
+    truth = np.stack([scene.cam_from_world[0] @ inverse(scene.cam_from_world[i]) for i in range(5)])
+    np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)  # the gauge: the world is the first camera
+    fit = procrustes(truth[:, :3, 3], found[:, :3, 3], np.ones(5), with_scale=True)
+    path = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
+    off = np.linalg.norm(fit.apply(found[:, :3, 3]) - truth[:, :3, 3], axis=1)
+    assert off.max() < 0.02 * path and report.cost_last <= report.cost_first
+    turns = [np.linalg.norm(se3_log(inverse(t) @ f)[3:]) for t, f in zip(truth, found, strict=True)]
+    assert max(turns) < 0.015
+    assert np.median([graph.median_inv_depth(i) for i in range(3)]) == pytest.approx(1.0)
+    for i in range(5):
+        seen = graph.blocks[i].depth_info > 1
+        ratio = fit.scale / graph.blocks[i].inv_depth[seen] / scene.depth(i)[seen]
+        assert np.median(np.abs(ratio - 1)) < 0.03
+
+
+def test_bootstrap_with_a_given_lens_keeps_it(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(5, step=0.2, focal_px=260.0)
+    given = CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5))
+    graph = graph_of(scene, 5, noise_px=0.1, camera=given)
+    assert bootstrap(graph)
+    assert np.exp(graph.lens.g[0]) == pytest.approx(260.0) and graph.lens.g[1] == 0.0
+    assert (graph.solve_all(5, 1.0).focal_sigma_ratio) == np.inf
+
+
+def test_bootstrap_says_no_without_matches(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(3, step=0.2)
+    graph = graph_of(scene, 3)
+    graph.edges = []
+    assert not bootstrap(graph) and not graph.initialised
+
+
+def test_a_window_moves_only_what_it_may(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(6, step=0.12)
+    graph = graph_of(scene, 6, noise_px=0.2, solved=True)
+    graph.config = replace(graph.config, window=3)
+    rng = np.random.default_rng(0)
+    for k in (4, 5):
+        graph.blocks[k].cam_from_world = se3_exp(rng.normal(0, 0.01, 6)) @ graph.blocks[k].cam_from_world
+    before = {k: b.cam_from_world.copy() for k, b in graph.blocks.items()}
+    disturbed = costs(graph).sum()
+    graph.solve_window()
+    for k in range(4):
+        assert (graph.blocks[k].cam_from_world == before[k]).all()
+    assert costs(graph).sum() < 0.5 * disturbed
+
+
+def test_normalise_changes_the_unit_and_nothing_else(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(4, step=0.2)
+    graph = graph_of(scene, 4, noise_px=0.3, solved=True)
+    frame = scene.work_frame(3)
+    motion = se3_exp(np.array([0.1, 0.2, 0.3, 0.1, 0, 0]))
+    graph.record(frame, 3, motion, "tracked", scene.matches(2, 3), np.ones(len(scene.px)))
+    before, depth, info = costs(graph), graph.blocks[1].inv_depth, graph.depth_info(1)
+    graph.normalise()
+    np.testing.assert_allclose(costs(graph), before, rtol=1e-9)
+    ratio = depth[0] / graph.blocks[1].inv_depth[0]
+    assert ratio != pytest.approx(1.0, abs=0.01)
+    np.testing.assert_allclose(graph.blocks[1].inv_depth * ratio, depth)
+    np.testing.assert_allclose(graph.depth_info(1), info * ratio**2)
+    np.testing.assert_allclose(graph.records[0].cam_from_kf[:3, 3], ratio * motion[:3, 3])
+    np.testing.assert_allclose(graph.records[0].cam_from_kf[:3, :3], motion[:3, :3])
+    np.testing.assert_allclose(np.median([graph.median_inv_depth(k) for k in range(3)]), 1.0)
+    again = graph.blocks[1].inv_depth.copy()
+    graph.normalise()
+    np.testing.assert_allclose(graph.blocks[1].inv_depth, again)
+
+
+def test_measured_depths_keep_their_unit(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(4, step=0.2)
+    graph = graph_of(scene, 4, solved=True)
+    for b in graph.blocks.values():
+        b.prior_info = 1 / (0.02 * b.inv_depth) ** 2
+    depth = graph.blocks[0].inv_depth.copy()
+    graph.normalise()
+    np.testing.assert_array_equal(graph.blocks[0].inv_depth, depth)
+
+
+def test_few_matches_make_no_edge(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(2, step=0.2)
+    graph = graph_of(scene, 2)
+    m = scene.matches(0, 1)
+    assert graph.connect(0, 1, m, np.ones(len(scene.px)))
+    kept = len(graph.edges)
+    few = replace(m, weight=m.weight * (np.arange(len(scene.px)) < 15))
+    assert not graph.connect(0, 1, few, np.ones(len(scene.px)))
+    assert not graph.connect(0, 1, m, np.zeros(len(scene.px)))  # everything there moves
+    assert len(graph.edges) == kept
+
+
+def test_a_record_keeps_the_strongest_matches(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(2, step=0.2, cell_px=8)
+    graph = graph_of(scene, 2)
+    p = len(scene.px)
+    weight = np.random.default_rng(0).uniform(0, 1, p)
+    entry = graph.record(scene.work_frame(1), 0, np.eye(4), "tracked", scene.matches(0, 1), weight)
+    assert len(entry.points) == 600 < p
+    assert weight[entry.points].min() >= np.sort(weight)[-600] - 1e-12
+    assert (np.diff(entry.points) > 0).all()
+    np.testing.assert_allclose(entry.target, scene.matches(0, 1).new_px[entry.points], atol=1e-4)
+
+
+@pytest.mark.parametrize("k", [-0.12, -0.03, 0.0, 0.05, 0.1])
+def test_the_camera_inverts_the_solvers_undistortion(k: float) -> None:
+    """u = x (1 + k x²) there, x = u (1 + k1 u²) here: the fitted k1 undoes it to a fraction of a pixel."""
+    size, focal_px = (320, 240), 260.0
+    k1 = radial_from_undistortion(focal_px, k, size)
+    assert np.sign(k1) == -np.sign(k)
+    lens = lens_for(CameraConfig(), *size, size)
+    lens.g[:2] = np.log(focal_px), k
+    camera = camera_of(lens, size)
+    assert camera.k1 == pytest.approx(k1) and camera.fx_px == pytest.approx(focal_px)
+    px = camera.pixel_grid()[::16, ::16].reshape(-1, 2)
+    x = (px - lens.g[2:]) / focal_px
+    u = x * (1 + k * (x**2).sum(1, keepdims=True))
+    back = camera.project(np.concatenate([u, np.ones((len(u), 1))], 1))
+    assert np.abs(back - px).max() < 1.0 and np.sqrt(((back - px) ** 2).sum(1).mean()) < 0.4
+
+
+def test_given_intrinsics_are_scaled_and_fixed() -> None:
+    lens = lens_for(CameraConfig(intrinsics=(600.0, 610.0, 320.0, 239.0)), 320, 240, (640, 480))
+    assert np.exp(lens.g[0]) == pytest.approx(np.sqrt(300 * 305))
+    np.testing.assert_allclose(lens.g[2:], [(320.5) / 2 - 0.5, (239.5) / 2 - 0.5])
+    assert not lens.free.any()
+    unknown = lens_for(CameraConfig(estimate_radial=False), 320, 240, (640, 480))
+    np.testing.assert_array_equal(unknown.free, [True, False, False, False])
+    assert lens_for(CameraConfig(), 320, 240, (640, 480)).free[:2].all()
+
+
+# -- dense depths ------------------------------------------------------------------------------------------------
+
+CAMERA = Camera.centred(260.0, 320, 240)
+PLANE = np.array([0.08, -0.05, 0.4])  # inverse depth = PLANE . ray, exactly linear over the image
+
+
+def plane_at(px: Array) -> Array:
+    return CAMERA.rays(px) @ PLANE
+
+
+def test_trust_is_half_at_a_tenth() -> None:
+    depth = np.array([0.5, 2.0])
+    np.testing.assert_allclose(trust(depth, 1 / (0.1 * depth) ** 2), 0.5)
+    assert trust(depth, np.full(2, 1e9)).min() > 0.99 and trust(depth, np.zeros(2)).max() < 1e-9
+
+
+def test_filling_keeps_what_is_known_and_bridges_the_rest(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(1)
+    truth = plane_at(scene.px)
+    rng = np.random.default_rng(0)
+    known = rng.random(len(truth)) < 0.6
+    info = np.where(known, 1e8, 1e-6)
+    found = filled(np.where(known, truth, 7.0), info, scene.grid)
+    np.testing.assert_allclose(found[known], truth[known], rtol=1e-3)
+    assert np.median(np.abs(found[~known] / truth[~known] - 1)) < 0.02
+    assert np.abs(found / truth - 1).max() < 0.15
+
+
+def test_upsampling_keeps_a_plane_and_the_size() -> None:
+    width, height, cell = 325, 247, 10  # a partial last row and column of cells
+    rows, cols = height // cell, width // cell
+    cy, cx = np.divmod(np.arange(rows * cols), cols)
+    centres = (np.stack([cx, cy], 1) + 0.5) * cell - 0.5
+    dense = upsampled(centres @ [0.01, -0.02] + 9, (rows, cols), width, height)
+    assert dense.shape == (height, width) and dense.dtype == np.float32
+    y, x = np.mgrid[5:235:7, 5:315:7]
+    np.testing.assert_allclose(dense[y, x], x * 0.01 - y * 0.02 + 9, atol=1e-4)
+
+
+def test_carrying_a_plane_into_another_view(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(1, cell_px=10)
+    motion = se3_exp(np.array([0.1, -0.05, 0.08, 0.02, -0.03, 0.05]))
+    at = np.random.default_rng(1).uniform(30, [290, 210], (80, 2))
+    # in the new view: n . (R' (X - t)) = 1  ->  inverse depth = (R n) . ray / (1 + (R n) . t)
+    n = motion[:3, :3] @ PLANE
+    truth = CAMERA.rays(at) @ n / (1 + n @ motion[:3, 3])
+    args = (scene.px, plane_at(scene.px))
+    value, trusted = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at)
+    assert np.median(np.abs(value / truth - 1)) < 0.01 and np.abs(value / truth - 1).max() < 0.05
+    assert np.median(trusted) > 0.8
+    away = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at + [600, 0])[1]
+    assert away.max() < 0.01
+    _, unknown = carried(*args, np.zeros(len(scene.px)), motion, CAMERA, at)
+    assert (unknown == 0).all()
+    behind = motion.copy()
+    behind[2, 3] = -20
+    assert (carried(*args, np.full(len(scene.px), 1e6), behind, CAMERA, at)[1] == 0).all()
+
+
+# -- places --------------------------------------------------------------------------------------------------------
+
+
+def test_overlap_falls_with_the_distance(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(6, step=0.3)
+    graph = graph_of(scene, 6, solved=True)
+    share, motion = overlap(graph, 2, graph.blocks[2].cam_from_world)
+    assert share == 1.0 and motion == pytest.approx(0, abs=1e-9)
+    shares, motions = zip(*(overlap(graph, 0, graph.blocks[k].cam_from_world) for k in range(4)), strict=True)
+    assert list(shares) == sorted(shares, reverse=True) and list(motions) == sorted(motions)
+    turned_away = se3_exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert overlap(graph, 0, turned_away) == (0.0, float("inf"))
+
+
+def test_covisible_takes_the_nearest_and_no_neighbours(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(9, step=0.04)
+    graph = graph_of(scene, 9, solved=True)
+    graph.blocks[8].cam_from_world = graph.blocks[3].cam_from_world.copy()  # the camera came back
+    assert covisible(graph, 8, 7, 4, 0.5) == [3, 1, 5] or covisible(graph, 8, 7, 4, 0.5) == [3, 5, 1]
+    assert covisible(graph, 8, 7, 1, 0.5) == [3]
+    assert covisible(graph, 8, 2, 4, 0.5)[0] == 1
+    graph.blocks[8].cam_from_world = se3_exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    assert covisible(graph, 8, 7, 4, 0.5) == []
+
+
+def test_places_know_a_picture_again(
+    exact_scene: Callable[..., Any], room_views: list[SyntheticView]
+) -> None:
+    scene = exact_scene(4)
+    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
+    grays = [v.frame.image[..., 1] for v in room_views[:2]] + [room_views[0].frame.image[:, ::-1, 1]]
+    p = len(scene.px)
+    for k, gray in enumerate(grays):
+        work = replace(scene.work_frame(k), gray=np.ascontiguousarray(gray))
+        graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
+    index = PlaceIndex()
+    like_first = np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8)  # brighter
+    assert [kf.id for kf in index.best(graph, like_first, skip=-1)][0] == 0
+    assert [kf.id for kf in index.best(graph, grays[2], skip=-1)][0] == 2
+    assert [kf.id for kf in index.best(graph, like_first, skip=0, count=1)] == [1]
+    graph.clear()
+    assert index.best(graph, like_first, skip=-1) == []
+
+
+def test_clearing_leaves_lost_frames(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(2)
+    graph = graph_of(scene, 2)
+    none = Matches(scene.px, scene.px, np.zeros(len(scene.px)))
+    graph.record(scene.work_frame(0), 0, np.eye(4), "tracked", none, none.weight)
+    graph.clear()
+    assert [r.state for r in graph.records] == ["lost"] and graph.keyframes == [] and graph.edges == []

@@ -1,0 +1,268 @@
+"""Two-view pointmaps: sub-pixel flow on pictures whose motion is known, triangulation, predicted flow, own depth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.geometry.camera import Camera
+from mastd3r.geometry.se3 import inverse, se3_exp, transform
+from mastd3r.pointmap.features import FeatureStart
+from mastd3r.pointmap.flow import FlowMatcher, corner_grid
+from mastd3r.pointmap.geometric import (
+    GeometricPointmaps,
+    SensorDepthPointmaps,
+    camera_flow,
+    sample_own,
+    triangulate,
+    working_size,
+)
+from mastd3r.sources.synthetic import SyntheticView, room_camera
+from mastd3r.types import Frame, Guess, Matches
+
+Array = NDArray[Any]
+WIDTH, HEIGHT = 320, 240
+
+
+class Texture:
+    """A sum of plane waves: a picture that is known between its pixels too."""
+
+    def __init__(self, seed: int = 0, waves: int = 80) -> None:
+        rng = np.random.default_rng(seed)
+        length_px = np.exp(rng.uniform(np.log(7), np.log(90), waves))
+        angle = rng.uniform(0, 2 * np.pi, waves)
+        self.k = 2 * np.pi / length_px * np.stack([np.cos(angle), np.sin(angle)])
+        self.phase = rng.uniform(0, 2 * np.pi, waves)
+        self.height = length_px**0.5
+        self.noise = np.random.default_rng(seed + 1)
+
+    def seen_at(self, at: Array) -> Array:
+        """(h, w) uint8 with one grey level of noise, of the picture at ``at`` (h, w, 2)."""
+        value = np.zeros(at.shape[:2])
+        for k, phase, height in zip(self.k.T, self.phase, self.height, strict=True):
+            value += height * np.sin(at @ k + phase)
+        value = 128 + 40 * value / np.sqrt((self.height**2).sum() / 2)
+        return np.rint(value + self.noise.normal(0, 1, value.shape)).clip(0, 255).astype(np.uint8)
+
+
+GRID = Camera.centred(1, WIDTH, HEIGHT).pixel_grid()
+CENTRE = np.array([(WIDTH - 1) / 2, (HEIGHT - 1) / 2])
+
+
+def turned(angle: float, zoom: float = 1.0) -> Array:
+    c, s = zoom * np.cos(angle), zoom * np.sin(angle)
+    return np.array([[c, -s], [s, c]])
+
+
+def pair_of(matrix: Array, shift: Array) -> tuple[Array, Array, Callable[[Array], Array]]:
+    """Pictures ref and new with new(M (x - c) + c + t) = ref(x), and the map of pixels."""
+    texture = Texture()
+    back = np.linalg.inv(matrix)
+    ref = texture.seen_at(GRID)
+    new = texture.seen_at((GRID - CENTRE - shift) @ back.T + CENTRE)
+    return ref, new, lambda px: (px - CENTRE) @ matrix.T + CENTRE + shift
+
+
+def error_px(matcher: FlowMatcher, pair: tuple, start: Array | None = None) -> tuple[float, float, float]:
+    """Median and 95th percentile of the error of the believed matches, and their share of those in view."""
+    ref, new, where = pair
+    px, _ = corner_grid(ref, 10)
+    found = matcher.match(ref, new, px, start)
+    truth = where(px)
+    visible = ((truth > 8) & (truth < [WIDTH - 9, HEIGHT - 9])).all(1)
+    used = (found.weight > 0.5) & visible
+    error = np.linalg.norm(found.target - truth, axis=1)[used]
+    return float(np.median(error)), float(np.percentile(error, 95)), float(used.sum() / visible.sum())
+
+
+@pytest.mark.parametrize(
+    ("matrix", "shift"),
+    [
+        (np.eye(2), np.array([0.0, 0.0])),
+        (np.eye(2), np.array([3.37, -2.61])),
+        (np.eye(2), np.array([-11.5, 6.25])),
+        (turned(np.deg2rad(4)), np.array([1.3, 2.2])),
+        (turned(0.0, 1.06), np.array([0.0, -3.7])),
+    ],
+)
+def test_flow_is_sub_pixel(matrix: Array, shift: Array) -> None:
+    median, p95, share = error_px(FlowMatcher(WIDTH, HEIGHT), pair_of(matrix, shift))
+    assert median < 0.1 and p95 < 0.4 and share > 0.8
+
+
+@pytest.mark.parametrize("start_error_px", [0.0, 2.5])
+def test_flow_with_a_start_follows_a_jump_of_60_px(start_error_px: float) -> None:
+    shift = np.array([60.3, -4.4])
+    start = np.tile(np.float32(shift + start_error_px), (HEIGHT, WIDTH, 1))
+    median, p95, share = error_px(FlowMatcher(WIDTH, HEIGHT), pair_of(np.eye(2), shift), start)
+    assert median < 0.1 and p95 < 0.4 and share > 0.8
+
+
+def test_flow_with_a_turning_start() -> None:
+    matrix, shift = turned(np.deg2rad(25)), np.array([12.0, 5.0])
+    pair = pair_of(matrix, shift)
+    start = (pair[2](GRID) - GRID).astype(np.float32)
+    median, _, share = error_px(FlowMatcher(WIDTH, HEIGHT), pair, start)
+    assert median < 0.1 and share > 0.8
+
+
+def test_pictures_without_anything_in_common_do_not_match() -> None:
+    ref, new = Texture(0).seen_at(GRID), Texture(50).seen_at(GRID)
+    px, _ = corner_grid(ref, 10)
+    same = FlowMatcher(WIDTH, HEIGHT).match(ref, ref, px)
+    other = FlowMatcher(WIDTH, HEIGHT).match(ref, new, px)
+    assert (other.weight > 0.5).mean() < 0.3 < (same.weight > 0.5).mean()
+    assert ((other.weight >= 0) & (other.weight <= 1)).all()
+
+
+def test_matches_outside_the_new_picture_have_no_weight() -> None:
+    pair = pair_of(np.eye(2), np.array([60.3, 0.0]))
+    start = np.tile(np.float32([60.3, 0.0]), (HEIGHT, WIDTH, 1))
+    px, _ = corner_grid(pair[0], 10)
+    found = FlowMatcher(WIDTH, HEIGHT).match(pair[0], pair[1], px, start)
+    assert (found.weight[pair[2](px)[:, 0] > WIDTH] == 0).all()
+
+
+def test_features_start_a_jump() -> None:
+    pair = pair_of(turned(np.deg2rad(20)), np.array([45.0, 10.0]))
+    flow = FeatureStart().flow(pair[0], pair[1])
+    assert flow is not None
+    truth = pair[2](GRID) - GRID
+    inside = ((pair[2](GRID) > 0) & (pair[2](GRID) < [WIDTH, HEIGHT])).all(-1)
+    assert np.median(np.linalg.norm(flow - truth, axis=-1)[inside]) < 1.5
+    assert FeatureStart().flow(pair[0], np.full_like(pair[1], 90)) is None
+
+
+def test_corner_grid_finds_the_corner_of_every_cell() -> None:
+    gray = np.full((67, 103), 60, np.uint8)  # not a multiple of the cell
+    rng = np.random.default_rng(0)
+    rows, cols, cell = 3, 5, 20
+    wanted = np.zeros((rows * cols, 2))
+    for n in range(rows * cols):
+        y, x = n // cols * cell + rng.integers(6, 14), n % cols * cell + rng.integers(6, 14)
+        gray[y - 1 : y + 2, x - 1 : x + 2] = 220
+        wanted[n] = x, y
+    px, strength = corner_grid(gray, cell)
+    assert px.shape == (rows * cols, 2) and strength.shape == (rows * cols,)
+    assert np.abs(px - wanted).max() <= 3 and (strength > 0).all()
+    flat, nothing = corner_grid(np.full((67, 103), 60, np.uint8), cell)
+    assert (nothing == 0).all() and len(flat) == rows * cols
+
+
+def test_working_size_keeps_the_shape_and_never_enlarges() -> None:
+    assert working_size(320, 240, 196608) == (320, 240)
+    assert working_size(1024, 768, 196608) == (512, 384)
+    w, h = working_size(1920, 1080, 196608)
+    assert w * h == pytest.approx(196608, rel=0.01) and w / h == pytest.approx(16 / 9, rel=0.01)
+
+
+def exact_matches(scene: Any, noise_px: float = 0.0) -> tuple[Matches, Array, Array, Camera]:
+    matches = scene.matches(0, 1, noise_px)
+    camera = Camera.centred(scene.focal_px, scene.width, scene.height)
+    return matches, scene.j_from_i(0, 1), 1 / scene.depth(0), camera
+
+
+def test_triangulation_is_exact_on_exact_matches(exact_scene: Callable[..., Any]) -> None:
+    matches, new_from_ref, truth, camera = exact_matches(exact_scene(2, step=0.3))
+    inv_depth, confidence = triangulate(matches, new_from_ref, camera)
+    seen = matches.weight > 0
+    np.testing.assert_allclose(inv_depth[seen], truth[seen], rtol=1e-9)
+    assert (confidence[~seen] == 0).all() and confidence[seen].min() > 0.5 and confidence.max() <= 1
+
+
+def test_confidence_falls_with_the_parallax(exact_scene: Callable[..., Any]) -> None:
+    means = []
+    for step in (0.4, 0.1, 0.03, 0.01, 0.001):
+        matches, new_from_ref, _, camera = exact_matches(exact_scene(2, step=step))
+        confidence = triangulate(matches, new_from_ref, camera)[1]
+        means.append(confidence[matches.weight > 0].mean())
+    assert all(a > b for a, b in zip(means, means[1:], strict=False))
+    assert means[0] > 0.8 and means[-1] < 0.02
+
+
+def test_confidence_falls_off_the_epipolar_line(exact_scene: Callable[..., Any]) -> None:
+    """A match that leaves its epipolar line by 3 px is not believed; one that moves along it is only elsewhere."""
+    matches, new_from_ref, _, camera = exact_matches(exact_scene(2, step=0.3))
+    points = transform(new_from_ref, camera.rays(matches.ref_px) * 1e-9)
+    epipole = camera.project(points)
+    along = matches.new_px - epipole
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = along[:, ::-1] * [1, -1]
+    seen = matches.weight > 0
+    off = triangulate(replace(matches, new_px=matches.new_px + 3 * across), new_from_ref, camera)[1]
+    on = triangulate(replace(matches, new_px=matches.new_px + 0.5 * along), new_from_ref, camera)[1]
+    assert off[seen].max() < 0.05 and np.median(on[seen]) > 0.5
+
+
+def test_points_behind_the_camera_have_no_confidence(exact_scene: Callable[..., Any]) -> None:
+    matches, new_from_ref, _, camera = exact_matches(exact_scene(2, step=0.3))
+    wrong = new_from_ref.copy()
+    wrong[:3, 3] *= -1
+    inv_depth, confidence = triangulate(matches, wrong, camera)
+    assert (confidence < 1e-3).mean() > 0.9 and (inv_depth > 0).all()
+
+
+def test_camera_flow_is_the_projection_of_moved_points() -> None:
+    rng = np.random.default_rng(0)
+    for k1 in (0.0, -0.08):
+        camera = Camera.centred(150, 80, 60, k1)
+        inv_depth = rng.uniform(0.2, 1.5, (60, 80))
+        motion = se3_exp(np.array([0.05, -0.03, 0.1, 0.02, 0.04, -0.03]))
+        flow = camera_flow(inv_depth, motion, camera, camera.pixel_grid())
+        for y, x in ((0, 0), (59, 79), (30, 17)):
+            point = transform(motion, camera.rays(np.array([x, y], float)) / inv_depth[y, x])
+            np.testing.assert_allclose(flow[y, x], camera.project(point) - [x, y], atol=1e-3)
+    behind = camera_flow(np.ones((60, 80)), se3_exp(np.array([0, 0, -3.0, 0, 0, 0])), camera, camera.pixel_grid())
+    assert np.isfinite(behind).all() and np.abs(behind).max() <= 160
+
+
+def test_geometric_provider_predicts_the_room(room_views: list[SyntheticView]) -> None:
+    """Real shading, exact poses: the depth of static pixels comes back up to the noise of the match."""
+    a, b = room_views[0], room_views[4]
+    provider, camera = GeometricPointmaps(160, 120, 10), room_camera(160, 120)
+    ref, new = provider.observe(a.frame), provider.observe(b.frame)
+    assert ref.px.shape == (12 * 16, 2) and ref.grid == (12, 16) and ref.own_inv_depth is None
+    motion = inverse(b.world_from_cam) @ a.world_from_cam
+    pair = provider.predict(ref, new, Guess(camera, new_from_ref=motion))
+    x, y = pair.ref.px.astype(int).T
+    truth = a.depth_m[y, x]
+    sure = (pair.ref.confidence > 0.1) & ~a.moving[y, x]
+    assert sure.sum() > 30 and pair.new_own is None
+    assert np.median(np.abs(pair.ref.points[sure, 2] / truth[sure] - 1)) < 0.05
+    unknown = provider.predict(ref, new, Guess(camera))
+    assert (unknown.ref.confidence == 0).all() and unknown.flow.shape == (120, 160, 2)
+
+
+def with_depth(view: SyntheticView) -> Frame:
+    return replace(view.frame, depth_m=view.depth_m)
+
+
+def test_sensor_depth_becomes_points_of_the_frame_itself(room_views: list[SyntheticView]) -> None:
+    provider, camera = SensorDepthPointmaps(160, 120, 10), room_camera(160, 120)
+    ref, new = (provider.observe(with_depth(v)) for v in (room_views[0], room_views[1]))
+    assert ref.own_inv_depth is not None
+    np.testing.assert_allclose(ref.own_inv_depth, 1 / room_views[0].depth_m, rtol=1e-6)
+    own = provider.predict(ref, new, Guess(camera)).new_own
+    assert own is not None
+    sure = own.confidence > 0
+    assert sure.mean() > 0.5
+    x, y = np.round(own.px[sure]).astype(int).T
+    np.testing.assert_allclose(own.points[sure, 2], room_views[1].depth_m[y, x], rtol=1e-6)
+    np.testing.assert_allclose(camera.project(own.points[sure]), own.px[sure], atol=1e-6)
+
+
+def test_sensor_depth_is_unknown_at_holes_and_edges(room_views: list[SyntheticView]) -> None:
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[:, 80:] = 4.0
+    depth[30:40, 20:30] = 0.0
+    provider = SensorDepthPointmaps(160, 120, 10)
+    work = provider.observe(replace(room_views[0].frame, depth_m=depth))
+    at = np.array([[10.0, 10], [79, 50], [80, 50], [100, 50], [25, 35], [30, 40]])
+    np.testing.assert_allclose(sample_own(work, at), [0.5, 0, 0, 0.25, 0, 0])
+    none = provider.observe(room_views[0].frame)
+    assert none.own_inv_depth is not None and (none.own_inv_depth == 0).all()
