@@ -126,9 +126,7 @@ def _arc(n: int, step: float) -> tuple[Array, ...]:
 def exact_scene() -> Callable[..., ExactScene]:
     """``exact_scene(n_views, step=…, focal_px=…, k=…)``."""
 
-    def make(
-        views: int, step: float = 0.15, focal_px: float = 260.0, k: float = 0.0, cell_px: int = 16
-    ) -> ExactScene:
+    def make(views: int, step: float = 0.15, focal_px: float = 260.0, k: float = 0.0, cell_px: int = 16) -> ExactScene:
         width, height = 320, 240
         rows, cols = height // cell_px, width // cell_px
         cy, cx = np.divmod(np.arange(rows * cols), cols)

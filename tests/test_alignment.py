@@ -169,9 +169,7 @@ def test_point_terms_agree_with_finite_differences(scene: Any) -> None:
     for i in range(7):
         step = np.zeros(7)
         step[i] = 1e-6
-        ends = [
-            transform(se3_exp(s * step[:6]) @ pose, ref) - np.exp(s * step[6]) * own for s in (1, -1)
-        ]
+        ends = [transform(se3_exp(s * step[:6]) @ pose, ref) - np.exp(s * step[6]) * own for s in (1, -1)]
         jac[..., i] = (ends[0] - ends[1]) / 2e-6 / sigma[:, None]
     squared = ((own - transform(pose, ref)) ** 2).sum(1) / sigma**2
     kernel = weight / (1 + squared / 4)
@@ -206,9 +204,7 @@ def align_module_own(pair: Pair) -> Any:
 
 @pytest.mark.parametrize("with_own", [True, False])
 @pytest.mark.parametrize("correction", CORRECTIONS)
-def test_every_correction_runs_and_says_what_it_did(
-    scene: Any, correction: CorrectionKind, with_own: bool
-) -> None:
+def test_every_correction_runs_and_says_what_it_did(scene: Any, correction: CorrectionKind, with_own: bool) -> None:
     found = Pair(scene, noise_px=0.3, depth_noise=0.01, with_own=with_own).align(correction)
     assert found.stages[0] == "raw"
     assert ("coarse" in found.stages) == (correction in ("coarse", "coarse-to-fine"))

@@ -74,9 +74,7 @@ def test_the_radial_term_is_that_of_the_conventions() -> None:
     camera = Camera(100, 200, 10, 20, 64, 48, k1=0.5)
     x, y = 0.3, -0.2
     s = 1 + 0.5 * (x * x + y * y)
-    np.testing.assert_allclose(
-        camera.project(np.array([2 * x, 2 * y, 2])), [10 + 100 * x * s, 20 + 200 * y * s]
-    )
+    np.testing.assert_allclose(camera.project(np.array([2 * x, 2 * y, 2])), [10 + 100 * x * s, 20 + 200 * y * s])
     np.testing.assert_allclose(camera.matrix @ [x, y, 1], [*camera.pinhole.project(np.array([x, y, 1])), 1])
 
 

@@ -36,9 +36,9 @@ class Edges:
         self.depth = rng.uniform(0.1, 1.0, points)
         self.pose = np.stack([se3_exp(rng.uniform(-0.12, 0.12, 6)) for _ in range(edges)])
         self.weight = rng.uniform(0.1, 1, (edges, points))
-        self.target = np.stack(
-            [self.px - self.residual(np.zeros(11), t, self.px) for t in self.pose]
-        ) + rng.normal(0, 3, (edges, points, 2))
+        self.target = np.stack([self.px - self.residual(np.zeros(11), t, self.px) for t in self.pose]) + rng.normal(
+            0, 3, (edges, points, 2)
+        )
 
     def residual(self, x: Array, pose: Array, target: Array) -> Array:
         """(p, 2) residuals after a step x = [pose (6), lens (4), depth]."""
@@ -139,9 +139,7 @@ def test_pose_system_is_the_schur_complement_of_the_joint_system(seed: int) -> N
     n = len(s.px)
     info = 10 ** np.random.default_rng(seed).uniform(-2, 6, n)
     ones = np.ones(n)
-    found_h, found_b, _ = pose_system(
-        s.px, s.depth, info, s.target[0], ones, s.pose[0], s.g, WIDE_PX
-    )
+    found_h, found_b, _ = pose_system(s.px, s.depth, info, s.target[0], ones, s.pose[0], s.g, WIDE_PX)
     jac = s.jacobian(0)
     rows = np.zeros((2 * n, 6 + n))
     rows[:, :6] = jac[..., :6].reshape(2 * n, 6)

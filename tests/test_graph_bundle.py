@@ -50,9 +50,7 @@ def lens_of(scene: Any, focal_ratio: float = 1.0, k: float = 0.0, free: bool = T
     return Lens(g, g.copy(), info)
 
 
-def check(
-    scene: Any, blocks: dict[int, Block], position_ratio: float, turn_rad: float, depth_ratio: float
-) -> float:
+def check(scene: Any, blocks: dict[int, Block], position_ratio: float, turn_rad: float, depth_ratio: float) -> float:
     """Poses and depths against the truth after Sim(3); the limits are of the path and the depth. The scale."""
     found = np.stack([inverse(blocks[k].cam_from_world) for k in range(VIEWS)])
     truth = np.stack([scene.cam_from_world[0] @ inverse(scene.cam_from_world[k]) for k in range(VIEWS)])

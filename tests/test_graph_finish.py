@@ -143,9 +143,7 @@ def test_moving_points_are_pruned_and_doubtful_ones_count_less(scene: Any) -> No
     cloud = static_cloud(graph, colors, moving)
     assert (cloud.kf_id == 1).sum() == p - p // 3 and (cloud.kf_id == 0).sum() == p
     np.testing.assert_array_equal(cloud.colors[cloud.kf_id == 1], colors[1][p // 3 :])
-    np.testing.assert_allclose(
-        cloud.confidence[cloud.kf_id == 2], 0.7 * whole.confidence[whole.kf_id == 2], rtol=1e-4
-    )
+    np.testing.assert_allclose(cloud.confidence[cloud.kf_id == 2], 0.7 * whole.confidence[whole.kf_id == 2], rtol=1e-4)
 
 
 def test_points_nobody_has_measured_are_pruned(scene: Any) -> None:

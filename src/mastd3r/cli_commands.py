@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import yaml
 from rich.console import Console
@@ -28,7 +28,7 @@ def dispatch(words: list[str]) -> int:
     args = parser.parse_args(words)
     console = Console(stderr=True)
     logging.basicConfig(
-        level=logging.INFO if args.verbose else logging.WARNING,
+        level=_log_level(args),
         format="%(message)s",
         handlers=[RichHandler(console=console, show_path=False, show_time=False)],
         force=True,
@@ -38,8 +38,22 @@ def dispatch(words: list[str]) -> int:
     return code
 
 
+def _log_level(args: argparse.Namespace) -> int:
+    """--quiet leaves stderr to the one line that says why a run failed; run.json has the warnings."""
+    if args.verbose:
+        return logging.INFO
+    return logging.CRITICAL if getattr(args, "quiet", False) else logging.WARNING
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as everything else does."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see {self.prog} --help")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="mastd3r", description="Trajectory, static map and clean splat from a video.")
+    parser = _Parser(prog="mastd3r", description="Trajectory, static map and clean splat from a video.")
     parser.add_argument("--version", action="version", version=__version__)
     parser.add_argument("-v", "--verbose", action="store_true", help="say more")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -81,7 +95,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--end", type=int, help="one past the last frame")
     p.add_argument("--stride", type=int, help="every n-th frame")
     p.add_argument("--seed", type=int)
-    p.add_argument("--quiet", action="store_true", help="no progress bars")
+    p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=_run)
 
 
@@ -108,9 +122,12 @@ def config_from_args(args: argparse.Namespace) -> Config:
 
 def _numbers(text: str) -> tuple[float, ...]:
     try:
-        return tuple(float(x) for x in text.replace(",", " ").split())
+        numbers = tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
         raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy[,k1], got {text!r}") from e
+    if not numbers:
+        raise ConfigError("--intrinsics: expected fx,fy,cx,cy[,k1], got nothing")
+    return numbers
 
 
 def _run(args: argparse.Namespace, console: Console) -> int:

@@ -34,7 +34,7 @@ class SourceConfig:
 class CameraConfig:
     """The lens. Empty = found from the video itself."""
 
-    intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1 k2 p1 p2 k3], pixels of the full-size image
+    intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1], pixels of the full-size image
     estimate_radial: bool = True  # find k1 beside the focal length, where the video can tell it
 
 
@@ -45,9 +45,8 @@ class TrackingConfig:
     area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
     cell_px: int = 10  # one matched pixel a cell of this size
     keyframe_motion_ratio: float = 0.08  # median image motion since the keyframe, share of the image width
-    keyframe_overlap_ratio: float = 0.55  # matched share of the keyframe's own matchable pixels, below: new keyframe
+    keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
     min_inlier_ratio: float = 0.35  # below: the pose is not believed
-    max_frames_between: int = 60  # a keyframe at least this often while the camera moves
 
 
 @dataclass(frozen=True)
@@ -121,8 +120,8 @@ def config_from_yaml(path: Path) -> Config:
     """Read a YAML file of overrides. Raises ConfigError."""
     try:
         data = yaml.safe_load(path.read_text()) or {}
-    except (OSError, yaml.YAMLError) as e:
-        raise ConfigError(f"config file {path}: expected readable YAML, got {e}") from e
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
+        raise ConfigError(f"config file {path}: expected readable YAML, got {_one_line(e)}") from e
     if not isinstance(data, dict):
         raise ConfigError(f"config file {path}: expected key: value pairs, got {type(data).__name__}")
     return config_from_dict(data)
@@ -133,7 +132,10 @@ def with_override(config: Config, dotted: str) -> Config:
     key, eq, text = dotted.partition("=")
     if not eq:
         raise ConfigError(f"--set: expected section.key=value, got {dotted!r}")
-    nested: Any = yaml.safe_load(text)
+    try:
+        nested: Any = yaml.safe_load(text)
+    except yaml.YAMLError as e:
+        raise ConfigError(f"--set {key}: expected a YAML value, got {text!r} ({_one_line(e)})") from e
     for part in reversed(key.split(".")):
         nested = {part: nested}
     return _merge(config, nested, "")
@@ -142,6 +144,10 @@ def with_override(config: Config, dotted: str) -> Config:
 def config_to_yaml(config: Config) -> str:
     """The whole effective configuration as YAML text."""
     return yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 def _plain(value: Any) -> Any:

@@ -43,7 +43,7 @@ class TwoView:
     weight: Array  # (p,) static weight of each match
     alignment: Alignment
     motion_ratio: float  # median image motion / width
-    kept_ratio: float  # matched share of what could be matched
+    matched: int  # weighted matches
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,13 @@ class Slam:
         self.config, self.parts = config, parts
         width, height = parts.size
         self.graph = KeyframeGraph(config.graph, config.camera, lens_for(config.camera, width, height, full_size))
+        self.graph.size = parts.size  # a run without a single keyframe still has a lens
         self.belief = DynamicBelief(config.dynamics, width, height)
         self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
         self._flow: Array | None = None  # latest keyframe -> last frame
         self._last: tuple[WorkFrame, Array] | None = None  # last tracked frame and its P(moving)
         self._cam_from_kf = np.eye(4)  # of the last tracked frame
+        self._most_matched = 0  # by any frame since the latest keyframe
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
@@ -125,7 +127,7 @@ class Slam:
             )
         else:
             alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
-        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, ref, self.parts.size[0]))
+        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size[0]))
 
     def _believed(self, view: TwoView) -> bool:
         enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
@@ -166,7 +168,9 @@ class Slam:
 
     def _wants_keyframe(self, view: TwoView) -> bool:
         t = self.config.tracking
-        return view.motion_ratio > t.keyframe_motion_ratio or view.kept_ratio < t.keyframe_overlap_ratio
+        self._most_matched = max(self._most_matched, view.matched)
+        thin = view.matched < t.keyframe_overlap_ratio * self._most_matched
+        return thin or view.motion_ratio > t.keyframe_motion_ratio
 
     def _promote_last(self, work: WorkFrame, moving: Array) -> Keyframe:
         prior_view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)
@@ -208,7 +212,7 @@ class Slam:
             graph.solve_window()
             if len(graph.keyframes) in (10, 16, 24, 40, 64, 100, 160, 256):
                 graph.solve_all(6, 1.0)
-        self._flow, self._cam_from_kf = None, np.eye(4)
+        self._flow, self._cam_from_kf, self._most_matched = None, np.eye(4), 0
         self._last = (work, moving)
         return kf
 
@@ -249,10 +253,9 @@ class Slam:
         return StepReport(work.index, work.timestamp_s, "lost", latest, False, why)
 
 
-def _motion(matches: Matches, weight: Array, ref: Keyframe, width: int) -> tuple[float, float]:
+def _motion(matches: Matches, weight: Array, width: int) -> tuple[float, int]:
     used = weight > 0.05
     if used.sum() < 10:
-        return float("inf"), 0.0
+        return float("inf"), 0
     moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
-    possible = (ref.work.texture * ref.static > 0.05).sum()
-    return float(np.median(moved)) / width, float(used.sum() / max(possible, 1))
+    return float(np.median(moved)) / width, int(used.sum())

@@ -86,18 +86,20 @@ class DynamicBelief:
     def _evidence(self, given: DynamicsInput, arrival: _Arrival) -> tuple[Array, Array, dict[str, Array]]:
         """(log ratios of this frame alone, log-odds carried over, every term by name), half size."""
         fresh = np.zeros((self._h, self._w), np.float32)
-        carried, terms = arrival.carried, {}
+        carried = arrival.carried
+        terms: dict[str, Array] = {}
         gaps = sorted({min(g, len(self._past)) for g in self.config.gaps} - {0})
         if self.config.use_motion and gaps:
             static = 1 - _sigmoid(carried)
             found = self._test.compare(given, arrival.gray, static, [self._past[-g] for g in gaps])
-            terms["motion"] = np.sum([c.log_ratio for c in found], axis=0, dtype=np.float32)
-            fresh = fresh + terms["motion"]
+            terms["motion"] = fresh = sum((c.log_ratio for c in found), fresh)
             if gaps[0] == 1:
                 carried = self._carry(arrival.gray, found[0].flow)  # a better flow than the one prior() had
         if self.config.use_depth and given.own_inv_depth is not None:
             terms["depth"] = self._shrink(depth_log_ratio(given, self.config))
-            fresh = fresh + terms["depth"]
+            # a thing where the map has nothing is no part of the map, also while it stands still
+            doubt = np.clip(1 - terms["depth"], 0, 1)
+            fresh = np.maximum(fresh, 0) + doubt * np.minimum(fresh, 0) + terms["depth"]
         terms["time"] = carried
         return fresh, carried, terms
 

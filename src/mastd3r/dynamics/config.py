@@ -36,7 +36,7 @@ class DynamicsConfig:
     photo_noise: float = 5.0  # grey levels, 1 sigma of an aligned static pixel
     photo_shift_px: float = 0.4  # misalignment that a static pixel may show
     photo_gain: float = 0.3  # weight of grey values that fit the rigid scene better than the flow
-    clash_gain: float = 1.2  # weight of grey values that nothing explains
+    clash_gain: float = 1.5  # weight of grey values that nothing explains
     carry_mismatch: float = 10.0  # normalised grey mismatch from which the carried belief fades
     depth_noise_ratio: float = 0.03  # noise of the frame's own depth, as a share of it
     region_px: float = 20.0  # reach of the pooling where there is no edge

@@ -18,7 +18,7 @@ _SPAN = 3.0  # width of the broad law on each side, in log depth: a factor of 20
 def depth_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
     """log P(Z|D) - log P(Z|not D), (h, w) float32, 0 where either depth is unknown.
 
-    Not D: normal around the background, its variance and the measurement's added, with a share of wrong depths.
+    Not D: normal around the background, its variance and the measurement's added, with a share of wrong depths on either side.
     D: uniform in log depth, with more mass in front of the background than behind.
     """
     if given.own_inv_depth is None:
@@ -32,5 +32,5 @@ def depth_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
     static = np.exp(-0.5 * (nearer / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     broad = np.where(nearer > 0, _FRONT, _BEHIND) / _SPAN
     still, wrong = config.still_share, config.outlier_share
-    ratio = np.log(still * static + (1 - still) * broad) - np.log((1 - wrong) * static + wrong * broad)
+    ratio = np.log(still * static + (1 - still) * broad) - np.log((1 - wrong) * static + wrong * 0.5 / _SPAN)
     return np.where(known, ratio, 0.0).astype(np.float32)

@@ -240,16 +240,25 @@ def radial_from_undistortion(focal_px: float, k: float, size: tuple[int, int]) -
     return float(((r_d - r) * r**3 * r_d).sum() / (r**6 * r_d).sum())
 
 
+def undistortion_from_radial(focal_px: float, k1: float, size: tuple[int, int]) -> float:
+    """k of x = x_d (1 + k x_d²) that fits x_d = x (1 + k1 x²) best over the image: the inverse of the above."""
+    r = np.linspace(0.05, 1.0, 40) * 0.5 * np.hypot(*size) / focal_px
+    r_d = r * (1 + k1 * r**2)
+    return float(((r - r_d) * r_d**3 * r).sum() / (r_d**6 * r).sum())
+
+
 def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int, int]) -> Lens:
     """The lens before anything is seen: given intrinsics fixed, otherwise centred with wide priors.
 
-    The optimisation knows one focal length, so fx and fy are joined by their geometric mean; distortion given
-    by ``--intrinsics`` has been removed from the images before they come here.
+    The optimisation knows one focal length, so fx and fy are joined by their geometric mean.
     """
     if camera.intrinsics:
         fx, fy, cx, cy = camera.intrinsics[:4]
         c = Camera(fx, fy, cx, cy, *full_size).resized(width, height)
-        g = np.array([0.5 * np.log(c.fx_px * c.fy_px), 0.0, c.cx_px, c.cy_px])
+        f = float(np.sqrt(c.fx_px * c.fy_px))
+        k1 = camera.intrinsics[4] if len(camera.intrinsics) > 4 else 0.0
+        k = undistortion_from_radial(f, k1, (width, height))
+        g = np.array([np.log(f), k, c.cx_px, c.cy_px])
         return Lens(g, g.copy(), np.full(4, np.inf))
     g = np.array([np.log(PRIOR_FOCAL_RATIO * max(width, height)), 0.0, (width - 1) / 2, (height - 1) / 2])
     radial = PRIOR_GAIN / PRIOR_RADIAL_SIGMA**2 if camera.estimate_radial else np.inf

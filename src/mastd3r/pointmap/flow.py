@@ -27,6 +27,7 @@ class FlowMatcher:
     def __init__(self, width: int, height: int, window_px: int = 13, tolerance_px: float = 1.0) -> None:
         self.width, self.height = width, height
         self.tolerance_px = tolerance_px
+        self.border_px = window_px
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
@@ -49,9 +50,7 @@ class FlowMatcher:
         """``new`` seen through a flow ref -> new, (h, w)."""
         return cv2.remap(new, self._grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
-    def match(
-        self, ref: Array, new: Array, px: Array, start: Array | None = None, *, near: bool = False
-    ) -> FlowResult:
+    def match(self, ref: Array, new: Array, px: Array, start: Array | None = None, *, near: bool = False) -> FlowResult:
         """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward.
 
         ``near``: the start is within a few pixels already, so a quick dense search will do.
@@ -59,6 +58,12 @@ class FlowMatcher:
         flow = self.dense(ref, new, start, fast=near)
         target, weight = self.refine(ref, new, px, flow)
         return FlowResult(target, weight, flow)
+
+    def _inside(self, px: Array) -> Array:
+        """Far enough from the border that the window sees no repeated pixels, which would pull matches inwards."""
+        edge = self.border_px
+        x, y = px[:, 0], px[:, 1]
+        return (x >= edge) & (y >= edge) & (x <= self.width - 1 - edge) & (y <= self.height - 1 - edge)
 
     def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
         """Lucas-Kanade from a dense start, on the image warped by it so that rotation and scale do not hurt."""
@@ -74,9 +79,7 @@ class FlowMatcher:
         moved = np.linalg.norm(forward - at, axis=-1)[:, 0]
         xy = forward[:, 0]
         target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
-        inside = (
-            (target[:, 0] > 1) & (target[:, 1] > 1) & (target[:, 0] < self.width - 2) & (target[:, 1] < self.height - 2)
-        )
+        inside = self._inside(target) & self._inside(px)
         ok = inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < self.tolerance_px) & (moved < 6.0)
         weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
         return target.astype(np.float64), weight.astype(np.float64)

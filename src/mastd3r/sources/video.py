@@ -214,9 +214,11 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     with container:
         if container.format.name == "image2" or container.format.name.endswith("_pipe"):
             raise InputError(f"{path}: expected a video or a folder of images, got a single image")
-        stream = next((s for s in container.streams.video if not _is_picture(s)), None)
+        stream = next((s for s in container.streams.video if s.codec_context and not _is_picture(s)), None)
         if stream is None:
-            raise InputError(f"{path}: expected a video, got a {container.format.name} file without moving pictures")
+            raise InputError(
+                f"{path}: expected a video, got a {container.format.name} file without moving pictures that can be read"
+            )
         yield container, stream
 
 
