@@ -23,10 +23,10 @@ Array = NDArray[Any]
 
 @pytest.fixture(scope="session")
 def room_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """24 frames of the made room at 160x120 and 10 frames a second, TUM layout with all truth. Read only."""
+    """24 frames of the made room at 160x120 and 5 frames a second, TUM layout with all truth. Read only."""
     folder = tmp_path_factory.mktemp("clips") / "room"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "CLIP_FPS", 10.0)
+        patch.setattr(synthetic, "CLIP_FPS", 5.0)
         return synthetic.make_room_clip(folder, frames=24, width=160, height=120)
 
 

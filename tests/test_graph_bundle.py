@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -158,7 +159,7 @@ def test_the_cost_never_rises(exact_scene: Callable[..., Any]) -> None:
     for _ in range(12):
         report = solve(blocks, edges, lens, fixed=frozenset([0]), iterations=1)
         costs += [report.cost_first, report.cost_last]
-    assert all(b <= a * (1 + 1e-6) for a, b in zip(costs, costs[1:], strict=False))
+    assert all(b <= a * (1 + 1e-6) for a, b in pairwise(costs))
 
 
 def test_a_keyframe_without_matches_stays_where_it_is(exact_scene: Callable[..., Any]) -> None:

@@ -22,10 +22,12 @@ from mastd3r.graph.keyframe_graph import (
     camera_of,
     lens_for,
     radial_from_undistortion,
+    undistortion_from_radial,
 )
 from mastd3r.graph.places import PlaceIndex, covisible, overlap
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.types import Matches
+from mastd3r.view_depth import rigid_flow
 
 Array = NDArray[Any]
 
@@ -201,6 +203,31 @@ def test_given_intrinsics_are_scaled_and_fixed() -> None:
     assert lens_for(CameraConfig(), 320, 240, (640, 480)).free[:2].all()
 
 
+def test_a_given_radial_term_reaches_the_solver_and_comes_back() -> None:
+    size = (320, 240)
+    for k1 in (-0.1, 0.04):
+        lens = lens_for(CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5, k1)), *size, size)
+        assert lens.g[1] == undistortion_from_radial(260.0, k1, size) and np.sign(lens.g[1]) == -np.sign(k1)
+        assert camera_of(lens, size).k1 == pytest.approx(k1, abs=0.15 * abs(k1))
+
+
+@pytest.mark.parametrize("k", [0.0, -0.05])
+def test_predicted_flow_is_the_projection_of_the_scene(exact_scene: Callable[..., Any], k: float) -> None:
+    scene = exact_scene(2, step=0.2, k=k, cell_px=10)
+    graph = graph_of(scene, 2, solved=True)
+    flow = rigid_flow(graph, 0, 1)
+    assert flow.shape == (240, 320, 2)
+    matches = scene.matches(0, 1)
+    at = np.round(scene.px).astype(int)
+    error = np.linalg.norm(flow[at[:, 1], at[:, 0]] - (matches.new_px - scene.px), axis=1)
+    moved = np.linalg.norm(matches.new_px - scene.px, axis=1)
+    assert np.median(error) < 0.1 * np.median(moved)
+    away = graph.blocks[1].cam_from_world.copy()
+    away[2, 3] -= 30  # everything is behind the second camera
+    graph.blocks[1].cam_from_world = away
+    assert np.isfinite(rigid_flow(graph, 0, 1)).all() and np.abs(rigid_flow(graph, 0, 1)).max() <= 640
+
+
 # -- dense depths ------------------------------------------------------------------------------------------------
 
 CAMERA = Camera.centred(260.0, 320, 240)
@@ -251,7 +278,7 @@ def test_carrying_a_plane_into_another_view(exact_scene: Callable[..., Any]) -> 
     value, trusted = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at)
     assert np.median(np.abs(value / truth - 1)) < 0.01 and np.abs(value / truth - 1).max() < 0.05
     assert np.median(trusted) > 0.8
-    away = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at + [600, 0])[1]
+    away = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at + np.array([600, 0]))[1]
     assert away.max() < 0.01
     _, unknown = carried(*args, np.zeros(len(scene.px)), motion, CAMERA, at)
     assert (unknown == 0).all()
@@ -295,8 +322,8 @@ def test_places_know_a_picture_again(exact_scene: Callable[..., Any], room_views
         graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
     index = PlaceIndex()
     like_first = np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8)  # brighter
-    assert [kf.id for kf in index.best(graph, like_first, skip=-1)][0] == 0
-    assert [kf.id for kf in index.best(graph, grays[2], skip=-1)][0] == 2
+    assert index.best(graph, like_first, skip=-1)[0].id == 0
+    assert index.best(graph, grays[2], skip=-1)[0].id == 2
     assert [kf.id for kf in index.best(graph, like_first, skip=0, count=1)] == [1]
     graph.clear()
     assert index.best(graph, like_first, skip=-1) == []

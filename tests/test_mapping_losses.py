@@ -13,10 +13,10 @@ from mastd3r.mapping.losses import (
     pixel_weight,
     squared_color_error,
     static_weight,
-    uncertainty,
     uncertainty_loss,
 )
 from mastd3r.mapping.ssim import _blur, _blur_torch, ssim_map
+from mastd3r.second_pass import uncertainty_weight
 
 STATIC = torch.tensor([[1.0, 0.5, 0.25, 0.0]])
 
@@ -36,9 +36,10 @@ def test_14_soft_and_hard_weight() -> None:
 
 
 def test_16_uncertainty_is_the_squared_residual_over_its_maximum_beyond_tau() -> None:
-    u = uncertainty(torch.tensor([[1.9, 2.1, 4.2, 0.0]]), tau_px=2.0)
-    assert torch.allclose(u, torch.tensor([[0.0, 0.25, 1.0, 0.0]]))
-    assert torch.all(uncertainty(torch.zeros(2, 2), 2.0) == 0)
+    residual_px = np.array([1.9, 2.1, 4.2, 0.0])
+    u = torch.from_numpy(uncertainty_weight(residual_px**2, tau_px=2.0)).float()
+    assert torch.allclose(u, torch.tensor([0.0, 0.25, 1.0, 0.0]))
+    assert np.all(uncertainty_weight(np.zeros(4), 2.0) == 0)
     assert float(uncertainty_loss(torch.tensor([[8.0, 4.0, 2.0, 1.0]]), u)) == pytest.approx((1 + 2) / 4)
 
 

@@ -20,6 +20,7 @@ from .config import Config, config_from_dict, config_from_yaml, config_to_yaml, 
 from .errors import ConfigError
 
 DEMO_SEED = 0
+DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
 
 
 def dispatch(words: list[str]) -> int:
@@ -172,7 +173,10 @@ def _demo(args: argparse.Namespace, console: Console) -> int:
         clip = Path(folder) / "room"
         with console.status("making the clip: a furnished room with a moving ball"):
             make_room_clip(clip, frames=args.frames, seed=DEMO_SEED)
-        code = _run_and_show(clip, args.out, Config(), args.words, console)
+        config = replace(
+            Config(), mapping=replace(Config().mapping, iterations=DEMO_STEPS, max_gaussians=DEMO_GAUSSIANS)
+        )
+        code = _run_and_show(clip, args.out, config, args.words, console)
         shutil.copy(clip / "rgb" / sorted(p.name for p in (clip / "rgb").iterdir())[0], args.out / "first_frame.png")
     return code
 

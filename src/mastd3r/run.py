@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +133,7 @@ class _Job:
                 self.slam.step(frame)
                 count += 1
                 bar.advance()
+        self.slam.close()
         self.folder.note(*self.source.notes)
         if count < 2:
             raise InputError(f"{self.source.name}: expected at least 2 frames, got {count}")
@@ -259,8 +260,4 @@ class _Job:
             yield
         finally:
             self.timings[stage] = time.perf_counter() - began
-
-
-def without_map(config: Config) -> Config:
-    """The same run without the Gaussian map."""
-    return replace(config, mapping=replace(config.mapping, enabled=False))
+            self.folder.record["timings_s"] = self.timings

@@ -155,6 +155,15 @@ class Slam:
         assert view is not None
         return latest, view
 
+    def close(self) -> None:
+        """After the last frame: make it a keyframe where it has moved on, so that what it alone sees is kept."""
+        if self._last is None or self._flow is None or not self.graph.initialised:
+            return
+        work, moving = self._last
+        view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)
+        if self._believed(view) and view.motion_ratio > 0.3 * self.config.tracking.keyframe_motion_ratio:
+            self._add_keyframe(work, moving, view)
+
     # -- keyframes -------------------------------------------------------------------------------------------
 
     def _start(self, work: WorkFrame, prior: Array) -> StepReport:
@@ -170,7 +179,8 @@ class Slam:
         t = self.config.tracking
         self._most_matched = max(self._most_matched, view.matched)
         thin = view.matched < t.keyframe_overlap_ratio * self._most_matched
-        return thin or view.motion_ratio > t.keyframe_motion_ratio
+        enough = t.keyframe_motion_ratio if self.graph.initialised else t.first_motion_ratio
+        return thin or view.motion_ratio > enough
 
     def _promote_last(self, work: WorkFrame, moving: Array) -> Keyframe:
         prior_view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)

@@ -15,7 +15,7 @@ Array = NDArray[Any]
 def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array, min_points: int = 5) -> float:
     """Factor s that brings new's depths to the previous scale: median over patches of med(z_pre)/med(z_t).
 
-    The paper prints the inverse ratio, which would double the error (paper-notes, (9)(10)).
+    The paper prints the inverse ratio, which would double the error (docs/paper_map.md, (9) (10)).
     Args: depth_pre, depth_new (n,) of the same surface points; patch (n,) integer patch of each; weight (n,).
     Returns 1.0 where no patch has ``min_points`` weighted points.
     """

@@ -17,7 +17,7 @@ from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
 from .depth import depth_log_ratio
 from .flow import HalfFlow
-from .motion import texture_information
+from .motion import Information, texture_information
 from .photo import mismatch, photo_variance
 from .regions import guided_coefficients, region_mean
 
@@ -29,6 +29,7 @@ class _Arrival:
     """A frame whose pose is not known yet, at half size."""
 
     gray: Array  # (h, w) uint8
+    texture: Information
     carried: Array  # (h, w) float32 log-odds of the last belief, along the flow
 
 
@@ -74,7 +75,7 @@ class DynamicBelief:
         limit = self.config.max_log_odds
         belief = np.clip(carried + self.config.evidence_gain * fresh, -limit, limit).astype(np.float32)
         semantic = self._semantic_log_odds(given.semantic)
-        shown = self._regions(belief, arrival.gray, given)
+        shown = self._regions(belief, arrival.gray, given, evidence.get("depth"))
         if given.semantic is not None and self.config.use_semantic:
             evidence["semantic"] = semantic
             shown = self.config.semantic_share * shown
@@ -91,10 +92,12 @@ class DynamicBelief:
         gaps = sorted({min(g, len(self._past)) for g in self.config.gaps} - {0})
         if self.config.use_motion and gaps:
             static = 1 - _sigmoid(carried)
-            found = self._test.compare(given, arrival.gray, static, [self._past[-g] for g in gaps])
+            found = self._test.compare(given, arrival.gray, arrival.texture, static, [self._past[-g] for g in gaps])
             terms["motion"] = fresh = sum((c.log_ratio for c in found), fresh)
             if gaps[0] == 1:
-                carried = self._carry(arrival.gray, found[0].flow)  # a better flow than the one prior() had
+                carried = self._carry(
+                    arrival.gray, found[0].flow, arrival.texture
+                )  # a better flow than the one prior() had
         if self.config.use_depth and given.own_inv_depth is not None:
             terms["depth"] = self._shrink(depth_log_ratio(given, self.config))
             # a thing where the map has nothing is no part of the map, also while it stands still
@@ -108,35 +111,42 @@ class DynamicBelief:
         if self._arrival is None or not np.array_equal(self._arrival.gray, small):
             carried = np.zeros((self._h, self._w), np.float32)
             if self._past and self.config.use_time:
-                carried = self._carry(small, self._flow.quick(small, self._past[-1].gray), fade=False)
-            self._arrival = _Arrival(small, carried)
+                carried = self._carry(small, self._flow.quick(small, self._past[-1].gray), None)
+            texture = texture_information(small, 7, self.config.texture_noise)
+            self._arrival = _Arrival(small, texture, carried)
         return self._arrival
 
-    def _carry(self, small: Array, to_last: Array, fade: bool = True) -> Array:
-        """Last belief along the flow, forgetting; also faded where the grey values say that the flow is wrong."""
+    def _carry(self, small: Array, to_last: Array, texture: Information | None) -> Array:
+        """Last belief along the flow, forgetting; with texture, also faded where grey values belie the flow."""
         if self._belief is None or not self.config.use_time:
             return np.zeros((self._h, self._w), np.float32)
         carried = self.config.memory * self._flow.pull(self._belief, to_last)
-        if not fade:
+        if texture is None:
             return carried
         seen = self._flow.pull(self._past[-1].gray.astype(np.float32), to_last, -100.0)
-        noise = photo_variance(texture_information(small, 7, self.config.texture_noise), self.config)
+        noise = photo_variance(texture, self.config)
         beyond = mismatch(small.astype(np.float32), seen, noise) - self.config.carry_mismatch
         return carried * np.exp(-0.5 * np.maximum(beyond, 0))
 
-    def _regions(self, belief: Array, small: Array, given: DynamicsInput) -> Array:
-        """Belief as whole objects, at full size: pooled inside edges, then brought to the full image's edges."""
+    def _regions(self, belief: Array, small: Array, given: DynamicsInput, sharp: Array | None) -> Array:
+        """Belief as whole objects, at full size: pooled inside edges, then brought to the full image's edges.
+
+        Flow bleeds over outlines, a measured depth (log ratio ``sharp``) does not: where it speaks nothing is pooled.
+        """
         if not self.config.use_regions:
             return self._full(belief)
         c = self.config
         guide = small.astype(np.float32)
         edges = guide
         if given.semantic is not None and c.use_semantic:
-            edges = np.stack([guide, c.semantic_contrast * self._shrink(given.semantic)], -1)
+            edges = cv2.merge([guide, (c.semantic_contrast * self._shrink(given.semantic)).astype(np.float32)])
         weight = 0.05 + np.minimum(np.abs(belief), 3.0) / 3
         pooled = region_mean(edges, belief, weight, c.region_px, c.region_contrast)
         a, b = guided_coefficients(guide, pooled, np.ones_like(pooled), c.edge_px, c.edge_contrast)
         full = self._full(a) * given.gray + self._full(b)
+        if sharp is not None:
+            alone = self._full(np.minimum(np.abs(sharp) / 2, 1))
+            full = alone * self._full(belief) + (1 - alone) * full
         return np.clip(full, -c.max_log_odds, c.max_log_odds).astype(np.float32)
 
     def _semantic_log_odds(self, semantic: Array | None) -> Array:

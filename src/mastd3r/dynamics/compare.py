@@ -16,6 +16,7 @@ from .config import DynamicsConfig
 from .data import DynamicsInput
 from .flow import HalfFlow
 from .motion import (
+    Information,
     RigidFlow,
     along_epipolar,
     flow_covariance,
@@ -23,7 +24,6 @@ from .motion import (
     pose_jacobian,
     residual_twist,
     rigid_flow,
-    texture_information,
 )
 from .photo import mismatch, photo_variance
 
@@ -56,13 +56,14 @@ class MotionTest:
         self._camera: Camera | None = None
         self._rays = np.zeros((3, height, width), np.float32)
 
-    def compare(self, given: DynamicsInput, small: Array, static: Array, past: Sequence[Past]) -> list[Comparison]:
+    def compare(
+        self, given: DynamicsInput, small: Array, texture: Information, static: Array, past: Sequence[Past]
+    ) -> list[Comparison]:
         """Log ratios against every given past frame. ``small`` (h, w) uint8, ``static`` (h, w) prior P(static)."""
         inv_depth, sigma = self._background(given)
         self._lens(given.camera)
-        information = texture_information(small, 7, self.config.texture_noise)
-        cov = flow_covariance(information, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
-        noise = photo_variance(information, self.config)
+        cov = flow_covariance(texture, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
+        noise = photo_variance(texture, self.config)
         return [self._one(given, small, static, p, (inv_depth, sigma), cov, noise) for p in past]
 
     def _one(

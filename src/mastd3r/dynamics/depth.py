@@ -18,7 +18,7 @@ _SPAN = 3.0  # width of the broad law on each side, in log depth: a factor of 20
 def depth_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
     """log P(Z|D) - log P(Z|not D), (h, w) float32, 0 where either depth is unknown.
 
-    Not D: normal around the background, its variance and the measurement's added, with a share of wrong depths on either side.
+    Not D: normal around the background, its variance and the measurement's added, with a share of wrong depths.
     D: uniform in log depth, with more mass in front of the background than behind.
     """
     if given.own_inv_depth is None:

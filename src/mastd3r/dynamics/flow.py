@@ -15,13 +15,13 @@ class HalfFlow:
     """DIS flow between two small grey images of one size."""
 
     def __init__(self, width: int, height: int) -> None:
-        self._fine = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._fine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._fine.setFinestScale(1)
         self._fine.setPatchSize(6)  # small patches: a moving thing's flow bleeds less over its outline
         self._fine.setPatchStride(4)
         self._fine.setGradientDescentIterations(10)
         self._fine.setVariationalRefinementIterations(3)
-        self._quick = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._quick = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         self._quick.setFinestScale(2)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self.grid = np.stack([x, y], -1)

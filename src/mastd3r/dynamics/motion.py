@@ -13,6 +13,7 @@ from ..geometry.camera import Camera
 from .config import DynamicsConfig
 
 Array = NDArray[Any]
+Information = tuple[Array, Array, Array]  # xx, xy, yy, each (h, w) px^-2
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: fl
     return twist
 
 
-def texture_information(gray: Array, window_px: int, noise: float) -> tuple[Array, Array, Array]:
+def texture_information(gray: Array, window_px: int, noise: float) -> Information:
     """Structure tensor over a window in units of ``noise`` grey levels: (xx, xy, yy), each (h, w), px^-2.
 
     Its inverse is the covariance that the image itself allows a flow vector to have there.
@@ -82,7 +83,7 @@ def texture_information(gray: Array, window_px: int, noise: float) -> tuple[Arra
     return xx, xy, yy
 
 
-def flow_covariance(information: tuple[Array, Array, Array], base_px: float, widest_px: float) -> Array:
+def flow_covariance(information: Information, base_px: float, widest_px: float) -> Array:
     """(h, w, 3) xx, xy, yy of the flow's covariance: the inverse texture information, between base and widest."""
     xx, xy, yy = information
     floor = 1 / (widest_px * widest_px)

@@ -47,10 +47,12 @@ def region_mean(guide: Array, value: Array, weight: Array, radius_px: float, edg
     A recursive filter in the domain transform of ``guide`` (Gastal, Oliveira 2011): an edge of ``edge`` grey levels
     is as long a way as ``radius_px`` pixels. Unlike a window it follows regions of any shape.
     """
-    layers = guide if guide.ndim == 3 else guide[..., None]
-    step_x = 1 + radius_px / edge * np.abs(np.diff(layers, axis=1)).sum(-1)
-    step_y = 1 + radius_px / edge * np.abs(np.diff(layers, axis=0)).sum(-1)
-    both = np.stack([value * weight, weight], -1).astype(np.float32)
+    step_x: Array = np.ones((1, 1), np.float32)
+    step_y: Array = np.ones((1, 1), np.float32)
+    for layer in [guide] if guide.ndim == 2 else cv2.split(guide):
+        step_x = step_x + np.float32(radius_px / edge) * np.abs(np.diff(layer, axis=1))
+        step_y = step_y + np.float32(radius_px / edge) * np.abs(np.diff(layer, axis=0))
+    both = cv2.merge([(value * weight).astype(np.float32), weight.astype(np.float32)])
     rounds = 3
     for i in range(rounds):
         sigma = radius_px * np.sqrt(3) * 2 ** (rounds - 1 - i) / np.sqrt(4**rounds - 1)

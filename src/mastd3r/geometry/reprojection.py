@@ -72,7 +72,6 @@ def _edge_point(
     jac[1, 5] = f * qx
     jd0 = fz * (t[0, 3] - qx * t[2, 3])
     jd1 = fz * (t[1, 3] - qy * t[2, 3])
-    # d(f pi(Y))/du, then the chain through u(x)
     p00 = fz * (t[0, 0] - qx * t[2, 0])
     p01 = fz * (t[0, 1] - qx * t[2, 1])
     p10 = fz * (t[1, 0] - qy * t[2, 0])

@@ -38,15 +38,6 @@ def mask_loss(error: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return (weight * error).mean()
 
 
-def uncertainty(residual_px: torch.Tensor, tau_px: float) -> torch.Tensor:
-    """u of eq. (16) from the norm of the reprojection residual: e/max e with e its square, 0 outside R.
-
-    R = {residual > tau_px}. The paper does not say whether tau is squared; its unit, pixels, decides.
-    """
-    squared = torch.where(residual_px > tau_px, residual_px.square(), torch.zeros_like(residual_px))
-    return squared / squared.max().clamp_min(1e-12)
-
-
 def uncertainty_loss(error: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
     """Sum over R of u times error, divided by the number of pixels: eq. (15)."""
     return (u * error).mean()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
 
 from ..config import SourceConfig
 from ..errors import InputError
@@ -13,13 +12,6 @@ from .tum import TumSource
 from .video import VideoSource
 
 
-class OpenedSource(Source, Protocol):
-    """A source that also tells what its frames can carry besides the image."""
-
-    has_depth: bool  # some frame has sensor depth (read only if asked for)
-    has_semantic: bool  # some frame has a map of P(movable thing)
-
-
 def open_source(
     path: str | Path,
     config: SourceConfig,
@@ -27,7 +19,7 @@ def open_source(
     want_depth: bool = False,
     want_semantic: bool = True,
     semantic_dir: Path | None = None,
-) -> OpenedSource:
+) -> Source:
     """Open a video file, a folder of images, or a TUM-layout folder (one with an rgb.txt).
 
     ``want_depth`` and ``want_semantic`` decide whether frames carry depth and semantic maps; what is not

@@ -1,0 +1,103 @@
+"""Between photographs, pinhole images and flows: what goes there comes back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.geometry.camera import Camera
+from mastd3r.lens_view import LensView
+from mastd3r.second_pass import is_holdout, uncertainty_weight
+from mastd3r.view_depth import cell_centres, chained_flow, invert_flow, static_at
+
+Array = NDArray[Any]
+
+
+def smooth_picture(width: int, height: int) -> Array:
+    y, x = np.mgrid[0:height, 0:width] / width
+    waves = [np.sin(9 * x + 4 * y), np.sin(7 * y - 3 * x), np.cos(8 * x * y)]
+    return np.rint(127 + 100 * np.stack(waves, -1)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("k1", [-0.12, -0.03, 0.05])
+def test_a_photograph_survives_the_pinhole_image(k1: float) -> None:
+    full = Camera.centred(300, 320, 240, k1)
+    view = LensView(full, 160, 2.0)
+    assert view.pinhole.k1 == 0 and (view.camera.width, view.camera.height) == (160, 120)
+    photo = smooth_picture(320, 240)
+    pinhole, inside = view.pinhole_image(photo)
+    assert pinhole.shape == (view.pinhole.height, view.pinhole.width, 3) and inside.shape == pinhole.shape[:2]
+    assert pinhole.min() >= 0 and pinhole.max() <= 1 and set(np.unique(inside)) <= {0.0, 1.0}
+    small = cv2.resize(photo, (160, 120), interpolation=cv2.INTER_AREA) / 255
+    back = view.as_photograph(pinhole)
+    assert back.shape == (120, 160, 3)
+    assert np.abs(back - small)[3:-3, 3:-3].max() < 0.03
+    # nothing of the photograph is cut: the pinhole image holds the ray of every pixel
+    seen = view.pinhole.project(view.camera.rays(view.camera.pixel_grid()))
+    assert seen.min() > -1 and (seen < [view.pinhole.width, view.pinhole.height]).all()
+
+
+def test_the_pinhole_image_is_straight() -> None:
+    """A point of the photograph lands where its ray meets the pinhole image."""
+    full = Camera.centred(300, 320, 240, -0.1)
+    view = LensView(full, 320, 2.0)
+    photo = np.zeros((240, 320, 3), np.uint8)
+    at = np.array([[40.0, 50], [280, 200], [160, 30]])
+    for x, y in at.astype(int):
+        cv2.circle(photo, (int(x), int(y)), 4, (255, 255, 255), -1)
+    pinhole, _ = view.pinhole_image(photo)
+    for x, y in view.pinhole.project(full.rays(at)):
+        near = pinhole[round(y) - 8 : round(y) + 9, round(x) - 8 : round(x) + 9, 0]
+        cy, cx = np.average(np.indices(near.shape).reshape(2, -1), axis=1, weights=near.reshape(-1))
+        assert abs(cx - 8 + round(x) - x) < 0.7 and abs(cy - 8 + round(y) - y) < 0.7
+
+
+def test_a_lens_without_distortion_changes_nothing() -> None:
+    view = LensView(Camera.centred(300, 320, 240), 320, 2.0)
+    photo = smooth_picture(320, 240)
+    pinhole, inside = view.pinhole_image(photo)
+    np.testing.assert_allclose(pinhole, photo / 255, atol=1e-6)
+    assert view.pad_px == 0 and inside.all() and view.as_photograph(pinhole) is pinhole
+    assert LensView(Camera.centred(300, 320, 240), 999, 2.0).camera.width == 320  # never enlarged
+
+
+def test_flows_are_inverted_and_chained() -> None:
+    x, y = np.meshgrid(np.arange(160, dtype=np.float32), np.arange(120, dtype=np.float32))
+    grid = np.stack([x, y], -1)
+    turn = np.array([[np.cos(0.02), -np.sin(0.02)], [np.sin(0.02), np.cos(0.02)]], np.float32)
+    first = (grid @ turn.T - grid + [3, -2]).astype(np.float32)
+    second = (grid @ turn @ np.diag([1.02, 1.02]) - grid).astype(np.float32)
+    there = grid + first
+    whole = there @ turn @ np.diag([1.02, 1.02]) - grid
+    inner = np.s_[12:-12, 12:-12]
+    np.testing.assert_allclose(chained_flow(first, second, grid)[inner], whole[inner], atol=0.05)
+    back = invert_flow(first, grid)
+    round_trip = chained_flow(first, back, grid)
+    assert np.abs(round_trip[inner]).max() < 0.15
+
+
+def test_static_weight_is_read_at_the_nearest_pixel_inside() -> None:
+    moving = np.zeros((4, 6), np.float32)
+    moving[1, 2], moving[3, 5] = 1.0, 0.25
+    px = np.array([[2.4, 0.6], [2.6, 1.0], [99, 99], [-5, -5]])
+    np.testing.assert_allclose(static_at(moving, px), [0, 1, 0.75, 1])
+
+
+def test_cell_centres_are_pixel_centres() -> None:
+    centres = cell_centres((2, 3), 35, 25)
+    np.testing.assert_allclose(centres[:4], [[5, 5], [16, 5], [27, 5], [5, 16]])
+
+
+def test_uncertainty_of_eq_16() -> None:
+    """u = e / max e over R = {e > tau²}; tau in pixels, e squared."""
+    e = np.array([1.0, 3.9, 4.1, 16.0, 8.0])
+    np.testing.assert_allclose(uncertainty_weight(e, 2.0), [0, 0, 4.1 / 16, 1, 0.5])
+    np.testing.assert_array_equal(uncertainty_weight(e, 5.0), 0)
+
+
+def test_every_eighth_frame_is_held_out() -> None:
+    assert [n for n in range(25) if is_holdout(n)] == [0, 8, 16, 24]
