@@ -71,7 +71,7 @@ class GraphConfig:
     final_iterations: int = 40
     kernel_px: float = 0.5  # Cauchy scale of the final optimisation
     loop_overlap_ratio: float = 0.5  # predicted share of points in view that makes an old keyframe a candidate
-    min_match_ratio: float = 0.15  # edges with a smaller matched share are dropped
+    min_match_ratio: float = 0.04  # edges with a smaller matched share are dropped
 
 
 @dataclass(frozen=True)

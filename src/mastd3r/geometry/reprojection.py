@@ -4,7 +4,7 @@ A host keyframe i owns inverse depths d at its grid pixels. A match of grid pixe
 
     u(x)  = (x - c)/f · (1 + k |x - c|²/f²)                    undistortion, unit plane
     Y     = R u(x) + t d,   (R, t) = j_from_i                  u(x) homogeneous
-    r     = f u(x') - f π(Y)                                   pixels
+    r     = x' - c - f v(π(Y))                                 pixels, v the inverse of u: as the image has them
 
 unknowns a pose perturbation of j (6), intrinsics g = (log f, k, cx, cy) (4), and d (1).
 """
@@ -34,6 +34,22 @@ def _undistort(x: float, y: float, f: float, k: float) -> tuple[float, float, fl
 
 
 @nb.njit(inline="always", **_JIT)
+def _distort(qx: float, qy: float, k: float) -> tuple[float, float, float]:
+    """v with v (1 + k |v|²) = q by Newton on the radius, and |v|²; -1 for a ray that the bent lens does not image."""
+    q2 = qx * qx + qy * qy
+    if k == 0.0 or q2 == 0.0:
+        return qx, qy, q2
+    ru = math.sqrt(q2)
+    if k < 0.0 and ru > 0.7 * math.sqrt(-0.3 / k):  # there 1 + 3 k r² falls below 0.1
+        return 0.0, 0.0, -1.0
+    r = ru
+    for _ in range(8):
+        r -= (r * (1.0 + k * r * r) - ru) / (1.0 + 3.0 * k * r * r)
+    s = r / ru
+    return qx * s, qy * s, r * r
+
+
+@nb.njit(inline="always", **_JIT)
 def _edge_point(
     px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, jac: Array
 ) -> tuple[float, float, float, float, float]:
@@ -52,11 +68,17 @@ def _edge_point(
     fz = f * iz
     qx = yx * iz
     qy = yy * iz
-    a = tx - g[2]
-    b = ty - g[3]
-    vx, vy, s2 = _undistort(a, b, f, k)
-    rx = f * (vx - qx)
-    ry = f * (vy - qy)
+    vx, vy, s2 = _distort(qx, qy, k)
+    if s2 < 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    rx = tx - g[2] - f * vx
+    ry = ty - g[3] - f * vy
+    # d v/d q, the inverse of d u/d x_d = (1 + k s²) I + 2 k v v^T
+    sj = 1.0 + k * s2
+    q = 2.0 * k / (sj * (sj + 2.0 * k * s2))
+    w00 = 1.0 / sj - q * vx * vx
+    w01 = -q * vx * vy
+    w11 = 1.0 / sj - q * vy * vy
     # pose of j, left perturbation: dY = d rho + phi x Y
     jac[0, 0] = fz * d
     jac[0, 1] = 0.0
@@ -79,20 +101,30 @@ def _edge_point(
     ex = x / f
     ey = y / f
     c1 = -(1.0 + 3.0 * k * r2)
-    jac[0, 6] = f * qx + c1 * (p00 * ex + p01 * ey) + 2.0 * k * s2 * a
-    jac[1, 6] = f * qy + c1 * (p10 * ex + p11 * ey) + 2.0 * k * s2 * b
-    jac[0, 7] = r2 * (p00 * ex + p01 * ey) - s2 * a
-    jac[1, 7] = r2 * (p10 * ex + p11 * ey) - s2 * b
+    jac[0, 6] = c1 * (p00 * ex + p01 * ey)
+    jac[1, 6] = c1 * (p10 * ex + p11 * ey)
+    jac[0, 7] = r2 * (p00 * ex + p01 * ey) - f * s2 * vx
+    jac[1, 7] = r2 * (p10 * ex + p11 * ey) - f * s2 * vy
     si = (1.0 + k * r2) / f
     m00 = si + 2.0 * k * ex * ex / f
     m01 = 2.0 * k * ex * ey / f
     m11 = si + 2.0 * k * ey * ey / f
-    sj = 1.0 + k * s2
-    q = 2.0 * k / (f * f)
-    jac[0, 8] = -(p00 * m00 + p01 * m01) + sj + q * a * a
-    jac[1, 8] = -(p10 * m00 + p11 * m01) + q * a * b
-    jac[0, 9] = -(p00 * m01 + p01 * m11) + q * a * b
-    jac[1, 9] = -(p10 * m01 + p11 * m11) + sj + q * b * b
+    jac[0, 8] = -(p00 * m00 + p01 * m01)
+    jac[1, 8] = -(p10 * m00 + p11 * m01)
+    jac[0, 9] = -(p00 * m01 + p01 * m11)
+    jac[1, 9] = -(p10 * m01 + p11 * m11)
+    for i in range(N_COLS):
+        j0 = jac[0, i]
+        jac[0, i] = w00 * j0 + w01 * jac[1, i]
+        jac[1, i] = w01 * j0 + w11 * jac[1, i]
+    j0 = jd0
+    jd0 = w00 * j0 + w01 * jd1
+    jd1 = w01 * j0 + w11 * jd1
+    # the prediction c + f v itself
+    jac[0, 6] += f * vx
+    jac[1, 6] += f * vy
+    jac[0, 8] += 1.0
+    jac[1, 9] += 1.0
     return rx, ry, jd0, jd1, yz
 
 

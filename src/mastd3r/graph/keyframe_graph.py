@@ -18,7 +18,7 @@ from .bundle import Block, Edge, Lens, SolveReport, solve
 Array = NDArray[Any]
 PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 0.85, 0.25  # focal / longer side of phones, webcams, cars; 1 sigma of its log
 PRIOR_RADIAL_SIGMA = 0.05
-PRIOR_GAIN = 100.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
+PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
@@ -107,7 +107,7 @@ class KeyframeGraph:
     def connect(self, i: int, j: int, matches: Matches, static_new: Array) -> bool:
         """Add matches of i's pixels in j as an edge; False where too few survive the static weight."""
         weight = matches.weight * self.keyframes[i].static * static_new
-        if (weight > 0.05).mean() < self.config.min_match_ratio * 0.5 or (weight > 0.05).sum() < 20:
+        if (weight > 0.05).mean() < self.config.min_match_ratio or (weight > 0.05).sum() < 20:
             return False
         self.edges.append(Edge(i, j, matches.new_px, weight))
         return True

@@ -27,7 +27,7 @@ class FlowMatcher:
     def __init__(self, width: int, height: int, window_px: int = 13, tolerance_px: float = 1.0) -> None:
         self.width, self.height = width, height
         self.tolerance_px = tolerance_px
-        self.border_px = window_px
+        self.border_px = window_px // 2 + 1
         self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
         self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
