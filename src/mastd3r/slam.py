@@ -24,6 +24,7 @@ from .types import Frame, Guess, Matches, PairPrediction, State, WorkFrame
 from .view_depth import (
     chained_flow,
     dynamics_input,
+    grown,
     invert_flow,
     own_depth_prior,
     predicted_depth,
@@ -78,7 +79,7 @@ class Slam:
         work = self.parts.provider.observe(frame)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
-        prior = self.belief.prior(work.gray, work.semantic)  # III-A, prior of (2)
+        prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
         if not self.graph.keyframes:
             return self._start(work, prior)
         kf, view = (
@@ -180,7 +181,8 @@ class Slam:
         self._most_matched = max(self._most_matched, view.matched)
         thin = view.matched < t.keyframe_overlap_ratio * self._most_matched
         enough = t.keyframe_motion_ratio if self.graph.initialised else t.first_motion_ratio
-        return thin or view.motion_ratio > enough
+        # something that passes in front thins the matches too, but from the same place nothing is gained
+        return view.motion_ratio > enough or (thin and view.motion_ratio > 0.4 * enough)
 
     def _promote_last(self, work: WorkFrame, moving: Array) -> Keyframe:
         prior_view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)
@@ -251,7 +253,7 @@ class Slam:
             return prior
         cam_from_world = view.alignment.new_from_ref @ self.graph.blocks[kf.id].cam_from_world
         given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
-        return self.belief.update(given).probability
+        return grown(self.belief.update(given).probability)
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
         if self.graph.keyframes and not self.graph.initialised:

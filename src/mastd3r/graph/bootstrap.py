@@ -16,69 +16,79 @@ from .keyframe_graph import KeyframeGraph, camera_of
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 FOCAL_RATIOS = (0.6, 0.8, 1.0, 1.3, 1.7)  # focal / longer image side, tried when the lens is not given
 
 
 def bootstrap(graph: KeyframeGraph) -> bool:
-    """Solve all keyframes of a graph that has none solved yet. False where no start was found (too little parallax)."""
-    given = not graph.lens.free[0]
-    best: tuple[float, Lens, dict[int, tuple[Array, Array]]] | None = None
-    for ratio in (None,) if given else FOCAL_RATIOS:
-        lens = Lens(graph.lens.prior.copy(), graph.lens.prior, graph.lens.prior_info)
-        if ratio is not None:
-            lens.g[0] = np.log(ratio * max(graph.size))
-        cost = _attempt(graph, lens)
-        if cost is not None and (best is None or cost < best[0]):
-            state = {k: (b.cam_from_world, b.inv_depth) for k, b in graph.blocks.items()}
-            best = (cost, Lens(lens.g, lens.prior, lens.prior_info), state)
+    """Solve all keyframes of a graph that has none solved yet. False where no start was found (too little parallax).
+
+    Several first pairs and focal lengths are tried, each to the end; the start that explains the matches best is
+    kept. World is the first keyframe's camera.
+    """
+    ratios = FOCAL_RATIOS if graph.lens.free[0] else (None,)
+    best: tuple[float, Array, dict[int, tuple[Array, Array]]] | None = None
+    for pair in _first_pairs(graph):
+        for ratio in ratios:
+            lens = Lens(graph.lens.prior.copy(), graph.lens.prior, graph.lens.prior_info)
+            if ratio is not None:
+                lens.g[0] = np.log(ratio * max(graph.size))
+            cost = _attempt(graph, lens, pair)
+            log.info("start from %d-%d: focal %.0f px, cost %s", pair.i, pair.j, np.exp(lens.g[0]), cost)
+            if cost is not None and (best is None or cost < best[0]):
+                best = (cost, lens.g, {k: (b.cam_from_world, b.inv_depth) for k, b in graph.blocks.items()})
     if best is None:
         return False
-    graph.lens = best[1]
+    graph.lens.g = best[1]
+    world_from_first = inverse(best[2][0][0])
     for k, (pose, depth) in best[2].items():
-        graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose, depth
+        graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose @ world_from_first, depth
     graph.normalise()
     graph.initialised = True
-    log.info(
-        "started with %d keyframes, focal %.0f px at working size",
-        len(graph.keyframes),
-        np.exp(graph.lens.g[0]),
-    )
+    log.info("started with %d keyframes, focal %.0f px at working size", len(graph.keyframes), np.exp(graph.lens.g[0]))
     return True
 
 
-def _attempt(graph: KeyframeGraph, lens: Lens) -> float | None:
+def _first_pairs(graph: KeyframeGraph) -> list[Edge]:
+    """Pairs to start from: many matches and much image motion, best first."""
+
+    def merit(edge: Edge) -> float:
+        used = edge.weight > 0.05
+        moved = np.linalg.norm(edge.target - graph.blocks[edge.i].px, axis=1)[used]
+        return float(used.sum() * min(np.median(moved) / (0.05 * max(graph.size)), 1.5))
+
+    forward = [e for e in graph.edges if e.i < e.j]
+    return sorted(forward, key=merit, reverse=True)[:FIRST_PAIRS]
+
+
+def _attempt(graph: KeyframeGraph, lens: Lens, pair: Edge) -> float | None:
     """Two views by the essential matrix, the others one by one, then all; the robust cost, None on failure."""
     _reset(graph)
-    first = next((e for e in graph.edges if e.i == 0 and e.j == 1), None)
-    if first is None or not _two_view(graph, lens, first):
+    if not _two_view(graph, lens, pair):
         return None
     frozen = Lens(lens.g, lens.prior, np.full(4, np.inf))
-    done = [0, 1]
-    solve(
-        {k: graph.blocks[k] for k in done},
-        graph.edges_among(done),
-        frozen,
-        fixed=frozenset([0]),
-        iterations=15,
-        kernel_px=2.0,
-    )
-    for k in range(2, len(graph.keyframes)):
-        before, block = graph.blocks[k - 1], graph.blocks[k]
-        block.cam_from_world = before.cam_from_world
-        block.inv_depth = before.inv_depth.copy()
-        _carry(graph, lens, k - 1, k)
+    done = [pair.i, pair.j]
+    _solve_part(graph, frozen, done, frozenset([pair.i]), 15, 2.0)
+    while len(done) < len(graph.keyframes):
+        k = min((k for k in graph.blocks if k not in done), key=lambda k: min(abs(k - d) for d in done))
+        nearest = min(done, key=lambda d: abs(k - d))
+        graph.blocks[k].cam_from_world = graph.blocks[nearest].cam_from_world
+        _carry(graph, lens, nearest, k)
         done.append(k)
-        hold = frozenset(done[:-1])
-        near = {q: graph.blocks[q] for q in done}
-        edges = [e for e in graph.edges_among(done) if k in (e.i, e.j)]
-        solve(near, edges, frozen, fixed=hold, iterations=15, kernel_px=4.0)
-        _carry(graph, lens, k - 1, k)
-        solve(near, graph.edges_among(done), frozen, fixed=frozenset([0]), iterations=6, kernel_px=2.0)
+        _solve_part(graph, frozen, done, frozenset(done[:-1]), 15, 4.0)
+        _carry(graph, lens, nearest, k)
+        _solve_part(graph, frozen, done, frozenset([pair.i]), 6, 2.0)
     only_focal = Lens(lens.g, lens.prior, np.where(np.arange(4) == 0, lens.prior_info, np.inf))
     report = solve(graph.blocks, graph.edges, only_focal, fixed=frozenset([0]), iterations=25, kernel_px=1.0)
     lens.g = only_focal.g
-    log.info("  start tried: focal %.0f px, cost %.1f", np.exp(lens.g[0]), report.cost_last)
     return report.cost_last if np.isfinite(report.cost_last) else None
+
+
+def _solve_part(
+    graph: KeyframeGraph, lens: Lens, ids: list[int], fixed: frozenset[int], iterations: int, kernel_px: float
+) -> None:
+    blocks = {k: graph.blocks[k] for k in ids}
+    solve(blocks, graph.edges_among(ids), lens, fixed=fixed, iterations=iterations, kernel_px=kernel_px)
 
 
 def _reset(graph: KeyframeGraph) -> None:
@@ -96,14 +106,14 @@ def _two_view(graph: KeyframeGraph, lens: Lens, edge: Edge) -> bool:
         return False
     f = float(np.exp(lens.g[0]))
     matrix = np.array([[f, 0, lens.g[2]], [0, f, lens.g[3]], [0, 0, 1.0]])
-    a, b = graph.blocks[0].px[used], edge.target[used]
+    a, b = graph.blocks[edge.i].px[used], edge.target[used]
     essential, inlier = cv2.findEssentialMat(a, b, matrix, cv2.USAC_MAGSAC, 0.999, 0.7)
     if essential is None or essential.shape != (3, 3):
         return False
     _, rotation, translation, _ = cv2.recoverPose(essential, a, b, matrix, mask=inlier)
-    graph.blocks[1].cam_from_world = np.eye(4)
-    graph.blocks[1].cam_from_world[:3, :3] = rotation
-    graph.blocks[1].cam_from_world[:3, 3] = 0.1 * translation[:, 0]
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, 0.1 * translation[:, 0]
+    graph.blocks[edge.j].cam_from_world = pose
     return True
 
 
