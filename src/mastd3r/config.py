@@ -44,8 +44,8 @@ class TrackingConfig:
 
     area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
     cell_px: int = 10  # one matched pixel a cell of this size
-    keyframe_motion_ratio: float = 0.08  # median image motion since the keyframe, share of the image width
-    first_motion_ratio: float = 0.05  # the same before lens and structure are started
+    keyframe_motion_ratio: float = 0.1  # upper quartile of image motion since the keyframe / sqrt(width * height)
+    first_motion_ratio: float = 0.06  # the same before lens and structure are started
     keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
     min_inlier_ratio: float = 0.35  # below: the pose is not believed
 

@@ -36,7 +36,7 @@ def finish_graph(graph: KeyframeGraph, config: Config) -> None:
     if not graph.initialised and (len(graph.keyframes) < 2 or not bootstrap(graph)):
         raise InputError(
             f"the camera never moves enough: expected image motion of at least "
-            f"{config.tracking.first_motion_ratio:.0%} of the width with parallax, got "
+            f"{config.tracking.first_motion_ratio:.0%} of the image with parallax, got "
             f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
         )
     graph.solve_all(config.graph.final_iterations // 2, 1.0)

@@ -43,7 +43,7 @@ class TwoView:
     pair: PairPrediction
     weight: Array  # (p,) static weight of each match
     alignment: Alignment
-    motion_ratio: float  # median image motion / width
+    motion_ratio: float  # upper quartile of the image motion / sqrt(width * height)
     matched: int  # weighted matches
 
 
@@ -128,7 +128,7 @@ class Slam:
             )
         else:
             alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
-        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size[0]))
+        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size))
 
     def _believed(self, view: TwoView) -> bool:
         enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
@@ -265,9 +265,9 @@ class Slam:
         return StepReport(work.index, work.timestamp_s, "lost", latest, False, why)
 
 
-def _motion(matches: Matches, weight: Array, width: int) -> tuple[float, int]:
+def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:
     used = weight > 0.05
     if used.sum() < 10:
         return float("inf"), 0
     moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
-    return float(np.median(moved)) / width, int(used.sum())
+    return float(np.quantile(moved, 0.75)) / float(np.sqrt(size[0] * size[1])), int(used.sum())

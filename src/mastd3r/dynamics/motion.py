@@ -104,15 +104,19 @@ def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Arr
     """log p(residual | moving) - log p(residual | static), (h, w) float32.
 
     Static: Normal(0, cov) with a share of wrong flow. Moving: the same widened by motion_spread_px, and a share
-    that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide.
+    that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
+    where a number is not finite.
     """
+    known = np.isfinite(residual).all(-1) & np.isfinite(cov).all(-1)
+    residual = np.clip(np.where(known[..., None], residual, 0), -_UNKNOWN_PX, _UNKNOWN_PX).astype(float)
+    cov = np.where(known[..., None], cov, 1.0).astype(float)  # squares of a lost pixel's numbers leave float32
     still = _log_normal(residual, cov, 0.0)
     wide = _log_normal(residual, cov, config.motion_spread_px**2)
     top = np.maximum(still, wide)
     a, b = np.exp(still - top), np.exp(wide - top)
     moving = config.still_share * a + (1 - config.still_share) * b
     static = (1 - config.outlier_share) * a + config.outlier_share * b
-    ratio: Array = (np.log(moving) - np.log(static)).astype(np.float32)
+    ratio: Array = np.where(known, np.log(moving) - np.log(static), 0).astype(np.float32)
     return ratio
 
 
@@ -121,5 +125,7 @@ _UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 square
 
 def along_epipolar(cov: Array, slope: Array, inv_depth_sigma: Array) -> Array:
     """``cov`` (h, w, 3) grown by the depth's 1 sigma along ``slope`` (h, w, 2): the part a depth may explain."""
-    dx, dy = slope[..., 0] * inv_depth_sigma, slope[..., 1] * inv_depth_sigma
+    reach = np.nan_to_num(slope * inv_depth_sigma[..., None], nan=_UNKNOWN_PX, posinf=_UNKNOWN_PX, neginf=-_UNKNOWN_PX)
+    reach = np.clip(reach, -_UNKNOWN_PX, _UNKNOWN_PX)
+    dx, dy = reach[..., 0], reach[..., 1]
     return cv2.add(cov, cv2.merge([dx * dx, dx * dy, dy * dy]))
