@@ -50,6 +50,59 @@ def _distort(qx: float, qy: float, k: float) -> tuple[float, float, float]:
 
 
 @nb.njit(inline="always", **_JIT)
+def _pose_columns(jac: Array, f: float, fz: float, d: float, qx: float, qy: float) -> None:
+    """Columns 0 to 5 of d(f q), q = pi(Y)."""
+    # pose of j, left perturbation: dY = d rho + phi x Y
+    jac[0, 0] = fz * d
+    jac[0, 1] = 0.0
+    jac[0, 2] = -fz * qx * d
+    jac[0, 3] = -f * qx * qy
+    jac[0, 4] = f * (1.0 + qx * qx)
+    jac[0, 5] = -f * qy
+    jac[1, 0] = 0.0
+    jac[1, 1] = fz * d
+    jac[1, 2] = -fz * qy * d
+    jac[1, 3] = -f * (1.0 + qy * qy)
+    jac[1, 4] = f * qx * qy
+    jac[1, 5] = f * qx
+
+
+@nb.njit(inline="always", **_JIT)
+def _lens_columns(
+    jac: Array,
+    f: float,
+    fz: float,
+    k: float,
+    x: float,
+    y: float,
+    r2: float,
+    bent_x: float,
+    bent_y: float,
+    t: Array,
+) -> None:
+    """Columns 6 to 9 of d(f q) through the host's ray u(x); ``bent`` = |v|² v is what k does at the other end."""
+    p00 = fz * (t[0, 0] - qx * t[2, 0])
+    p01 = fz * (t[0, 1] - qx * t[2, 1])
+    p10 = fz * (t[1, 0] - qy * t[2, 0])
+    p11 = fz * (t[1, 1] - qy * t[2, 1])
+    ex = x / f
+    ey = y / f
+    c1 = -(1.0 + 3.0 * k * r2)
+    jac[0, 6] = c1 * (p00 * ex + p01 * ey)
+    jac[1, 6] = c1 * (p10 * ex + p11 * ey)
+    jac[0, 7] = r2 * (p00 * ex + p01 * ey) - f * bent_x
+    jac[1, 7] = r2 * (p10 * ex + p11 * ey) - f * bent_y
+    si = (1.0 + k * r2) / f
+    m00 = si + 2.0 * k * ex * ex / f
+    m01 = 2.0 * k * ex * ey / f
+    m11 = si + 2.0 * k * ey * ey / f
+    jac[0, 8] = -(p00 * m00 + p01 * m01)
+    jac[1, 8] = -(p10 * m00 + p11 * m01)
+    jac[0, 9] = -(p00 * m01 + p01 * m11)
+    jac[1, 9] = -(p10 * m01 + p11 * m11)
+
+
+@nb.njit(inline="always", **_JIT)
 def _edge_point(
     px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, jac: Array
 ) -> tuple[float, float, float, float, float]:
@@ -79,40 +132,10 @@ def _edge_point(
     w00 = 1.0 / sj - q * vx * vx
     w01 = -q * vx * vy
     w11 = 1.0 / sj - q * vy * vy
-    # pose of j, left perturbation: dY = d rho + phi x Y
-    jac[0, 0] = fz * d
-    jac[0, 1] = 0.0
-    jac[0, 2] = -fz * qx * d
-    jac[0, 3] = -f * qx * qy
-    jac[0, 4] = f * (1.0 + qx * qx)
-    jac[0, 5] = -f * qy
-    jac[1, 0] = 0.0
-    jac[1, 1] = fz * d
-    jac[1, 2] = -fz * qy * d
-    jac[1, 3] = -f * (1.0 + qy * qy)
-    jac[1, 4] = f * qx * qy
-    jac[1, 5] = f * qx
+    _pose_columns(jac, f, fz, d, qx, qy)
+    _lens_columns(jac, f, fz, k, x, y, r2, s2 * vx, s2 * vy, t)
     jd0 = fz * (t[0, 3] - qx * t[2, 3])
     jd1 = fz * (t[1, 3] - qy * t[2, 3])
-    p00 = fz * (t[0, 0] - qx * t[2, 0])
-    p01 = fz * (t[0, 1] - qx * t[2, 1])
-    p10 = fz * (t[1, 0] - qy * t[2, 0])
-    p11 = fz * (t[1, 1] - qy * t[2, 1])
-    ex = x / f
-    ey = y / f
-    c1 = -(1.0 + 3.0 * k * r2)
-    jac[0, 6] = c1 * (p00 * ex + p01 * ey)
-    jac[1, 6] = c1 * (p10 * ex + p11 * ey)
-    jac[0, 7] = r2 * (p00 * ex + p01 * ey) - f * s2 * vx
-    jac[1, 7] = r2 * (p10 * ex + p11 * ey) - f * s2 * vy
-    si = (1.0 + k * r2) / f
-    m00 = si + 2.0 * k * ex * ex / f
-    m01 = 2.0 * k * ex * ey / f
-    m11 = si + 2.0 * k * ey * ey / f
-    jac[0, 8] = -(p00 * m00 + p01 * m01)
-    jac[1, 8] = -(p10 * m00 + p11 * m01)
-    jac[0, 9] = -(p00 * m01 + p01 * m11)
-    jac[1, 9] = -(p10 * m01 + p11 * m11)
     for i in range(N_COLS):
         j0 = jac[0, i]
         jac[0, i] = w00 * j0 + w01 * jac[1, i]
