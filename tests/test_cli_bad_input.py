@@ -252,7 +252,6 @@ def test_a_camera_that_never_moves(mastd3r: Command, room_clip: Path, tmp_path: 
     assert len(said.poses()) == 20
 
 
-@pytest.mark.xfail(strict=True, reason="a start is believed without asking how many matches agree with it")
 def test_noise_without_a_scene(mastd3r: Command, tmp_path: Path) -> None:
     """Every frame another noise: nothing can be followed, and nothing may pretend that it was."""
     folder = tmp_path / "noise"

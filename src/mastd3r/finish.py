@@ -63,10 +63,17 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
 
 
 def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
-    block, keep = graph.blocks[record.kf_id], record.points
-    if len(keep) < 20:
+    if len(record.points) < 20:
         return guess
-    matches = StaticMatches(
+    matches = kept_matches(graph, record)
+    near = solve_pose(matches, guess, kernel_px=3.0).new_from_ref
+    return solve_pose(matches, near, kernel_px=1.0).new_from_ref
+
+
+def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:
+    """The matches that a frame kept of its keyframe, with the keyframe's depths as they are now."""
+    block, keep = graph.blocks[record.kf_id], record.points
+    return StaticMatches(
         block.px[keep],
         block.inv_depth[keep],
         graph.depth_info(record.kf_id)[keep],
@@ -74,8 +81,6 @@ def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
         record.weight.astype(float),
         graph.lens.g,
     )
-    near = solve_pose(matches, guess, kernel_px=3.0).new_from_ref
-    return solve_pose(matches, near, kernel_px=1.0).new_from_ref
 
 
 def _bridged(frames: list[FinalFrame]) -> list[FinalFrame]:

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment.reproject import StaticMatches
 from .config import HOLDOUT_EVERY, Config
 from .dynamics.belief import DynamicBelief
 from .dynamics.data import DynamicMask
-from .finish import FinalFrame
-from .geometry.se3 import inverse
+from .finish import FinalFrame, kept_matches
+from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .lens_view import LensView
 from .parts import Parts
@@ -54,6 +53,7 @@ def second_pass(
     belief = DynamicBelief(config.dynamics, *parts.size)
     chosen = _view_positions(final, config)
     by_index = {f.record.index: f for f in final}
+    waiting: list[int] = []  # keyframes without colours yet
     for position, frame in enumerate(frames):
         place = by_index.get(frame.index)
         if place is None:
@@ -63,12 +63,14 @@ def second_pass(
         given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0)
         mask = belief.update(given)
         on_mask(frame.timestamp_s, mask)
+        if place.record.is_keyframe:
+            waiting.append(place.record.kf_id)
         if is_holdout(position):
             out.holdout.append(place)
             continue
-        if place.record.is_keyframe:
-            out.colors[place.record.kf_id] = _colors_at(frame.image, work.px, parts.size)
-            out.moving[place.record.kf_id] = 1 - static_at(mask.probability, work.px)
+        for kf_id in waiting:  # a holdout keyframe takes its colours from the frame after it
+            out.colors[kf_id], out.moving[kf_id] = _seen_by(frame.image, mask.probability, graph, kf_id, place)
+        waiting.clear()
         if position in chosen:
             out.views.append(_view(frame, place, mask.probability, graph, parts, lens_view))
     return out
@@ -83,10 +85,20 @@ def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
     return {usable[int(i)] for i in np.linspace(0, len(usable) - 1, most).round()} if most else set()
 
 
-def _colors_at(image: Array, px: Array, size: tuple[int, int]) -> Array:
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    at = np.round(px).astype(int)
-    return small[at[:, 1], at[:, 0]]
+def _seen_by(image: Array, moving: Array, graph: KeyframeGraph, kf_id: int, place: FinalFrame) -> tuple[Array, Array]:
+    """Colours (p, 3) uint8 and P(moving) (p,) of a keyframe's points in a frame's image; outside counts as moving."""
+    block, camera = graph.blocks[kf_id], graph.camera()
+    if place.record.is_keyframe and place.record.kf_id == kf_id:
+        px = block.px
+    else:
+        cam_from_kf = inverse(place.world_from_cam) @ graph.world_from_cam(kf_id)
+        points = transform(cam_from_kf, camera.rays(block.px) / np.maximum(block.inv_depth, 1e-9)[:, None])
+        in_front = points[:, 2] > 0
+        px = np.where(in_front[:, None], camera.project(np.where(in_front[:, None], points, 1.0)), -1e3)
+    inside = (px > -0.5).all(1) & (px[:, 0] < camera.width - 0.5) & (px[:, 1] < camera.height - 0.5)
+    at = np.clip(np.round(px), 0, [camera.width - 1, camera.height - 1]).astype(int)
+    small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0)
 
 
 def _view(
@@ -112,15 +124,7 @@ def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int],
     record, block = place.record, graph.blocks[place.record.kf_id]
     if len(record.points) == 0:
         return None
-    keep = record.points
-    matches = StaticMatches(
-        block.px[keep],
-        block.inv_depth[keep],
-        graph.depth_info(record.kf_id)[keep],
-        record.target.astype(float),
-        record.weight.astype(float),
-        graph.lens.g,
-    )
+    matches = kept_matches(graph, record)
     new_from_ref = inverse(place.world_from_cam) @ inverse(block.cam_from_world)
     error = np.minimum(matches.residual_px(new_from_ref), 50.0) ** 2
     u = uncertainty_weight(error, lens_view.tau_px)

@@ -89,7 +89,10 @@ class Slam:
         if not self._believed(view):
             kf, view = self._retry(work, prior)
         if not self._believed(view):
-            return self._lost(work, f"only {view.alignment.inlier_ratio:.0%} of the matches agree on a pose")
+            count = int((view.weight > 0.05).sum())
+            return self._lost(
+                work, f"{count} static matches, {view.alignment.inlier_ratio:.0%} of them agree on a pose"
+            )
         moving = self._update_belief(work, kf, view, prior)  # III-A, (2)(3)
         self.graph.record(work, kf.id, view.alignment.new_from_ref, "tracked", view.pair.matches, view.weight)
         self._flow, self._cam_from_kf = view.pair.flow, view.alignment.new_from_ref

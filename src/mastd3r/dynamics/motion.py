@@ -107,7 +107,7 @@ def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Arr
     that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
     where a number is not finite.
     """
-    known = np.isfinite(residual).all(-1) & np.isfinite(cov).all(-1)
+    known: Array = np.asarray(np.isfinite(residual).all(-1) & np.isfinite(cov).all(-1))
     residual = np.clip(np.where(known[..., None], residual, 0), -_UNKNOWN_PX, _UNKNOWN_PX).astype(float)
     cov = np.where(known[..., None], cov, 1.0).astype(float)  # squares of a lost pixel's numbers leave float32
     still = _log_normal(residual, cov, 0.0)

@@ -78,6 +78,8 @@ def _lens_columns(
     r2: float,
     bent_x: float,
     bent_y: float,
+    qx: float,
+    qy: float,
     t: Array,
 ) -> None:
     """Columns 6 to 9 of d(f q) through the host's ray u(x); ``bent`` = |v|² v is what k does at the other end."""
@@ -133,7 +135,7 @@ def _edge_point(
     w01 = -q * vx * vy
     w11 = 1.0 / sj - q * vy * vy
     _pose_columns(jac, f, fz, d, qx, qy)
-    _lens_columns(jac, f, fz, k, x, y, r2, s2 * vx, s2 * vy, t)
+    _lens_columns(jac, f, fz, k, x, y, r2, s2 * vx, s2 * vy, qx, qy, t)
     jd0 = fz * (t[0, 3] - qx * t[2, 3])
     jd1 = fz * (t[1, 3] - qy * t[2, 3])
     for i in range(N_COLS):

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.reprojection import edge_residuals
 from ..geometry.se3 import inverse
 from .bundle import Edge, Lens, solve
 from .depth import carried
@@ -16,6 +17,7 @@ from .keyframe_graph import KeyframeGraph, camera_of
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+MIN_AGREEMENT = 0.4  # of the matches, for a start to be believed
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 FOCAL_RATIOS = (0.6, 0.8, 1.0, 1.3, 1.7)  # focal / longer image side, tried when the lens is not given
 
@@ -43,10 +45,26 @@ def bootstrap(graph: KeyframeGraph) -> bool:
     world_from_first = inverse(best[2][0][0])
     for k, (pose, depth) in best[2].items():
         graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose @ world_from_first, depth
+    agreeing = _agreement(graph)
+    if agreeing < MIN_AGREEMENT:
+        log.info("no start: only %.0f %% of the matches fit one camera and one static scene", 100 * agreeing)
+        return False
     graph.normalise()
     graph.initialised = True
     log.info("started with %d keyframes, focal %.0f px at working size", len(graph.keyframes), np.exp(graph.lens.g[0]))
     return True
+
+
+def _agreement(graph: KeyframeGraph) -> float:
+    """Share of all weighted matches within 2 px of where poses and depths put them."""
+    close = total = 0
+    for e in graph.edges:
+        block, used = graph.blocks[e.i], e.weight > 0.05
+        j_from_i = graph.blocks[e.j].cam_from_world @ inverse(block.cam_from_world)
+        residual, _ = edge_residuals(block.px, block.inv_depth, e.target, j_from_i, graph.lens.g)
+        close += int((np.hypot(residual[:, 0], residual[:, 1])[used] < 2.0).sum())
+        total += int(used.sum())
+    return close / max(total, 1)
 
 
 def _first_pairs(graph: KeyframeGraph) -> list[Edge]:

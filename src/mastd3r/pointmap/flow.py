@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 
+MOST_UNLIKE = 30.0  # mean difference of two windows in grey levels, beyond which they show different things
+
+
 @dataclass(frozen=True)
 class FlowResult:
     """Flow at the chosen pixels, and the dense field it came from."""
@@ -69,7 +72,7 @@ class FlowMatcher:
         """Lucas-Kanade from a dense start, on the image warped by it so that rotation and scale do not hurt."""
         warped = self.warp(new, flow)
         at = px.astype(np.float32).reshape(-1, 1, 2)
-        forward, found, _ = cv2.calcOpticalFlowPyrLK(
+        forward, found, unlike = cv2.calcOpticalFlowPyrLK(
             ref, warped, at, at.copy(), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **self._lk
         )
         back, found_back, _ = cv2.calcOpticalFlowPyrLK(
@@ -80,7 +83,14 @@ class FlowMatcher:
         xy = forward[:, 0]
         target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
         inside = self._inside(target) & self._inside(px)
-        ok = inside & (found[:, 0] > 0) & (found_back[:, 0] > 0) & (error < self.tolerance_px) & (moved < 6.0)
+        ok = (
+            inside
+            & (found[:, 0] > 0)
+            & (unlike[:, 0] < MOST_UNLIKE)
+            & (found_back[:, 0] > 0)
+            & (error < self.tolerance_px)
+            & (moved < 6.0)
+        )
         weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
         return target.astype(np.float64), weight.astype(np.float64)
 
