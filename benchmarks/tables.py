@@ -48,10 +48,18 @@ def main() -> int:
         metrics = entry.get("metrics", {})
         cells = [_cell(metrics.get(key), form) for key, (_, form) in COLUMNS.items()]
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    lines += ["", "## Commands", "", "| run | command | wall [s] | date | machine |", "|---|---|---|---|---|"]
+    lines += [
+        "",
+        "## Commands",
+        "",
+        "| run | command | wall [s] | date | commit | machine |",
+        "|---|---|---|---|---|---|",
+    ]
     for name, entry in entries.items():
         machine = f"{entry['processor']}, {entry['cores']} cores"
-        lines.append(f"| {name} | `{entry['command']}` | {entry['wall_s']} | {entry['date']} | {machine} |")
+        lines.append(
+            f"| {name} | `{entry['command']}` | {entry['wall_s']} | {entry['date']} | {entry['git_commit']} | {machine} |"
+        )
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     target.write_text("\n".join(lines).rstrip() + "\n")

@@ -19,7 +19,7 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_AGREEMENT = 0.4  # of the matches, for a start to be believed
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
-FOCAL_RATIOS = (0.6, 0.8, 1.0, 1.3, 1.7)  # focal / longer image side, tried when the lens is not given
+FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the lens is not given
 
 
 def bootstrap(graph: KeyframeGraph) -> bool:
@@ -34,7 +34,7 @@ def bootstrap(graph: KeyframeGraph) -> bool:
         for ratio in ratios:
             lens = Lens(graph.lens.prior.copy(), graph.lens.prior, graph.lens.prior_info)
             if ratio is not None:
-                lens.g[0] = np.log(ratio * max(graph.size))
+                lens.g[0] = np.log(ratio * np.sqrt(graph.size[0] * graph.size[1]))
             cost = _attempt(graph, lens, pair)
             log.info("start from %d-%d: focal %.0f px, cost %s", pair.i, pair.j, np.exp(lens.g[0]), cost)
             if cost is not None and (best is None or cost < best[0]):

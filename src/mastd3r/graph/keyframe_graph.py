@@ -16,7 +16,7 @@ from ..types import Matches, State, WorkFrame
 from .bundle import Block, Edge, Lens, SolveReport, solve
 
 Array = NDArray[Any]
-PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 0.85, 0.25  # focal / longer side of phones, webcams, cars; 1 sigma of its log
+PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
 PRIOR_RADIAL_SIGMA = 0.05
 PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
@@ -260,6 +260,6 @@ def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int
         k = undistortion_from_radial(f, k1, (width, height))
         g = np.array([np.log(f), k, c.cx_px, c.cy_px])
         return Lens(g, g.copy(), np.full(4, np.inf))
-    g = np.array([np.log(PRIOR_FOCAL_RATIO * max(width, height)), 0.0, (width - 1) / 2, (height - 1) / 2])
+    g = np.array([np.log(PRIOR_FOCAL_RATIO * np.sqrt(width * height)), 0.0, (width - 1) / 2, (height - 1) / 2])
     radial = PRIOR_GAIN / PRIOR_RADIAL_SIGMA**2 if camera.estimate_radial else np.inf
     return Lens(g, g.copy(), np.array([PRIOR_GAIN / PRIOR_FOCAL_SIGMA**2, radial, np.inf, np.inf]))
