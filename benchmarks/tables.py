@@ -57,9 +57,8 @@ def main() -> int:
     ]
     for name, entry in entries.items():
         machine = f"{entry['processor']}, {entry['cores']} cores"
-        lines.append(
-            f"| {name} | `{entry['command']}` | {entry['wall_s']} | {entry['date']} | {entry['git_commit']} | {machine} |"
-        )
+        when = f"{entry['wall_s']} | {entry['date']} | {entry['git_commit']}"
+        lines.append(f"| {name} | `{entry['command']}` | {when} | {machine} |")
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     target.write_text("\n".join(lines).rstrip() + "\n")
