@@ -9,10 +9,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .patches import align_patches, window
+
 Array = NDArray[Any]
 
 
-MOST_UNLIKE = 30.0  # mean difference of two windows in grey levels, beyond which they show different things
+LEAST_ALIKE = 0.7  # correlation of two patches, below which they show different things
+SMOOTH_PX = 5.0  # blur of the dense flow before its slope is taken as the local warp
+MOST_BENT = 0.45  # largest entry of the local warp's difference from the identity; keeps it invertible
+ITERATIONS = 12
 
 
 @dataclass(frozen=True)
@@ -25,7 +30,7 @@ class FlowResult:
 
 
 class FlowMatcher:
-    """DIS flow from a predicted field, then Lucas-Kanade both ways at the chosen pixels."""
+    """DIS flow from a predicted field, then patch alignment both ways at the chosen pixels."""
 
     def __init__(self, width: int, height: int, window_px: int = 13, tolerance_px: float = 1.0) -> None:
         self.width, self.height = width, height
@@ -35,10 +40,7 @@ class FlowMatcher:
         self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self._grid = np.stack([x, y], -1)
-        self._lk: dict[str, Any] = {
-            "winSize": (window_px, window_px),
-            "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.01),
-        }
+        self._window = window(window_px, 0.27 * window_px)
 
     def dense(self, ref: Array, new: Array, start: Array | None = None, *, fast: bool = False) -> Array:
         """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched."""
@@ -69,30 +71,34 @@ class FlowMatcher:
         return (x >= edge) & (y >= edge) & (x <= self.width - 1 - edge) & (y <= self.height - 1 - edge)
 
     def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
-        """Lucas-Kanade from a dense start, on the image warped by it so that rotation and scale do not hurt."""
-        warped = self.warp(new, flow)
-        at = px.astype(np.float32).reshape(-1, 1, 2)
-        forward, found, unlike = cv2.calcOpticalFlowPyrLK(
-            ref, warped, at, at.copy(), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **self._lk
-        )
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-            warped, ref, forward, at.copy(), maxLevel=1, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, **self._lk
-        )
-        error = np.linalg.norm(back - at, axis=-1)[:, 0]
-        moved = np.linalg.norm(forward - at, axis=-1)[:, 0]
-        xy = forward[:, 0]
-        target = xy + cv2.remap(flow, xy[:, None], None, cv2.INTER_LINEAR)[:, 0]
-        inside = self._inside(target) & self._inside(px)
+        """Patches of ref at ``px`` found in new from a dense start, and back again: (p, 2) pixels, (p,) weight."""
+        smooth = cv2.GaussianBlur(flow, (0, 0), SMOOTH_PX)
+        start, affine = _local(smooth, px)
+        a, b = ref.astype(np.float32), new.astype(np.float32)
+        target, alike = align_patches(a, b, px, start, affine, self._window, ITERATIONS)
+        again = np.where(alike[:, None] > LEAST_ALIKE, target, -1.0)  # outside: not looked at
+        back, alike_back = align_patches(b, a, again, px, np.linalg.inv(affine), self._window, ITERATIONS)
+        error = np.linalg.norm(back - px, axis=1)
         ok = (
-            inside
-            & (found[:, 0] > 0)
-            & (unlike[:, 0] < MOST_UNLIKE)
-            & (found_back[:, 0] > 0)
+            self._inside(target)
+            & self._inside(px)
+            & (np.minimum(alike, alike_back) > LEAST_ALIKE)
             & (error < self.tolerance_px)
-            & (moved < 6.0)
+            & (np.linalg.norm(target - start, axis=1) < 6.0)
         )
-        weight = np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
-        return target.astype(np.float64), weight.astype(np.float64)
+        return target, np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
+
+
+def _local(flow: Array, px: Array) -> tuple[Array, Array]:
+    """Where ``px`` (p, 2) go, and the warp around them (p, 2, 2) d new / d ref, by differences over 3 px."""
+    at = px.astype(np.float32)[:, None]
+
+    def flow_at(dx: float, dy: float) -> Array:
+        moved = at + np.array([dx, dy], np.float32)
+        return cv2.remap(flow, moved, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
+
+    slope = np.stack([flow_at(3, 0) - flow_at(-3, 0), flow_at(0, 3) - flow_at(0, -3)], -1) / 6.0
+    return px + flow_at(0, 0), np.clip(slope, -MOST_BENT, MOST_BENT) + np.eye(2)
 
 
 def corner_grid(gray: Array, cell_px: int) -> tuple[Array, Array]:
