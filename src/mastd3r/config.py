@@ -19,6 +19,7 @@ PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
 SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
 CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
+PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
 
 
 @dataclass(frozen=True)
@@ -34,8 +35,8 @@ class SourceConfig:
 class CameraConfig:
     """The lens. Empty = found from the video itself."""
 
-    intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1], pixels of the full-size image
-    estimate_radial: bool = True  # find k1 beside the focal length, where the video can tell it
+    intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1 [k2 p1 p2 [k3 [k4 k5 k6]]]], OpenCV, full-size pixels
+    estimate_radial: bool = True  # find radial terms and principal point beside the focal length, where the video can
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class TrackingConfig:
     keyframe_motion_ratio: float = 0.1  # upper quartile of image motion since the keyframe / sqrt(width * height)
     first_motion_ratio: float = 0.06  # the same before lens and structure are started
     keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
+    known_overlap_ratio: float = 0.8  # share of an older keyframe's points in view, above: it may be used again
+    known_motion_ratio: float = 0.06  # median image motion from an older keyframe / width, below: the same
     min_inlier_ratio: float = 0.35  # below: the pose is not believed
 
 
@@ -63,7 +66,8 @@ class GraphConfig:
     """Joint optimisation over keyframes."""
 
     bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
-    radial_keyframes: int = 12  # keyframes before the radial term is estimated
+    radial_keyframes: int = 12  # keyframes before the first radial term is estimated
+    lens_keyframes: int = 32  # keyframes before principal point and higher radial terms are
     neighbours: int = 6  # previous keyframes that a new one is matched with
     covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with
     window: int = 8  # keyframes that move in the windowed optimisation
@@ -92,6 +96,16 @@ class MappingConfig:
     refine_poses: bool = True  # move the training cameras through the render gradient
 
 
+@dataclass(frozen=True)
+class NetworksConfig:
+    """The networks behind --pointmaps mast3r and --semantics dinov2. Weights: an installed name, a hub id or a path."""
+
+    mast3r: str = "mast3r"  # a file
+    dinov2: str = "dinov2-with-registers-small"  # a folder
+    precision: PrecisionKind = "auto"  # of the matrix products; auto: bfloat16 on an accelerator, float32 on the CPU
+    long_side_px: int = 512  # of the image that MASt3R sees, a multiple of 16; it was trained at 512
+
+
 HOLDOUT_EVERY = 8  # frames 0, 8, 16 … of those read are never shown to the map
 
 
@@ -110,6 +124,7 @@ class Config:
     graph: GraphConfig = field(default_factory=GraphConfig)
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     mapping: MappingConfig = field(default_factory=MappingConfig)
+    networks: NetworksConfig = field(default_factory=NetworksConfig)
 
 
 def config_from_dict(data: dict[str, Any]) -> Config:

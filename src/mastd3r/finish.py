@@ -16,6 +16,7 @@ from .geometry.se3 import interpolate, inverse
 from .graph.bootstrap import bootstrap
 from .graph.depth import filled, trust
 from .graph.keyframe_graph import FrameRecord, KeyframeGraph
+from .graph.submaps import bridge_submaps
 from .types import State, StaticCloud, Trajectory
 
 Array = NDArray[Any]
@@ -33,7 +34,7 @@ class FinalFrame:
 
 def finish_graph(graph: KeyframeGraph, config: Config) -> None:
     """Start what never started, then optimise everything. Raises InputError for a camera that never moves."""
-    if not graph.initialised and (len(graph.keyframes) < 2 or not bootstrap(graph)):
+    if not graph.started and (len(graph.members()) < 2 or not bootstrap(graph)):
         raise InputError(
             f"the camera never moves enough: expected image motion of at least "
             f"{config.tracking.first_motion_ratio:.0%} of the image with parallax, got "
@@ -41,6 +42,8 @@ def finish_graph(graph: KeyframeGraph, config: Config) -> None:
         )
     graph.solve_all(config.graph.final_iterations // 2, 1.0)
     report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    for first, last in bridge_submaps(graph):
+        log.warning("frames %d to %d were never joined to the rest: placed by continuity", first, last)
     log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
              len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
 

@@ -9,18 +9,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment.align import align
-from .alignment.reproject import StaticMatches
-from .alignment.result import Alignment
+from .compare import Comparer, TwoView
 from .config import Config
 from .dynamics.belief import DynamicBelief
 from .geometry.se3 import inverse
 from .graph.bootstrap import bootstrap
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
-from .graph.places import covisible
+from .graph.places import covisible, nearest_keyframe
+from .graph.submaps import join, scale_between
 from .parts import Parts
 from .sources.checks import frame_is_blank
-from .types import Frame, Guess, Matches, PairPrediction, State, WorkFrame
+from .types import Frame, Guess, State, WorkFrame
 from .view_depth import (
     chained_flow,
     dynamics_input,
@@ -29,22 +28,12 @@ from .view_depth import (
     own_depth_prior,
     predicted_depth,
     rigid_flow,
+    rigid_flow_to,
     static_at,
 )
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class TwoView:
-    """One pair, compared: what the provider said, the static weight of its matches, and the pose."""
-
-    pair: PairPrediction
-    weight: Array  # (p,) static weight of each match
-    alignment: Alignment
-    motion_ratio: float  # upper quartile of the image motion / sqrt(width * height)
-    matched: int  # weighted matches
 
 
 @dataclass(frozen=True)
@@ -65,14 +54,17 @@ class Slam:
     def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
         self.config, self.parts = config, parts
         width, height = parts.size
-        self.graph = KeyframeGraph(config.graph, config.camera, lens_for(config.camera, width, height, full_size))
+        self.graph = KeyframeGraph(config.graph, lens_for(config.camera, width, height, full_size))
         self.graph.size = parts.size  # a run without a single keyframe still has a lens
         self.belief = DynamicBelief(config.dynamics, width, height)
+        self.comparer = Comparer(config, parts, self.graph)
         self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
-        self._flow: Array | None = None  # latest keyframe -> last frame
+        self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
+        self._before_loss: Keyframe | None = None  # the same, when the camera was lost
+        self._flow: Array | None = None  # ref -> last frame
         self._last: tuple[WorkFrame, Array] | None = None  # last tracked frame and its P(moving)
-        self._cam_from_kf = np.eye(4)  # of the last tracked frame
-        self._most_matched = 0  # by any frame since the latest keyframe
+        self._cam_from_ref = np.eye(4)  # of the last tracked frame
+        self._most_matched = 0  # by any frame since ref was chosen
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
@@ -80,104 +72,113 @@ class Slam:
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
         prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
-        if not self.graph.keyframes:
-            return self._start(work, prior)
-        kf, view = (
-            self.graph.latest,
-            self._compare(self.graph.latest, work, prior, self._flow, self._cam_from_kf),
-        )
-        if not self._believed(view):
+        if self._ref is None:
+            return self._start(work, prior, "first view")
+        kf, view = self._ref, self._find(work, prior)
+        if view is None:
             kf, view = self._retry(work, prior)
-        if not self._believed(view):
-            count = int((view.weight > 0.05).sum())
-            return self._lost(
-                work, f"{count} static matches, {view.alignment.inlier_ratio:.0%} of them agree on a pose"
-            )
+        if view is None:
+            return self._start_again(work, prior)
         moving = self._update_belief(work, kf, view, prior)  # III-A, (2)(3)
         self.graph.record(work, kf.id, view.alignment.new_from_ref, "tracked", view.pair.matches, view.weight)
-        self._flow, self._cam_from_kf = view.pair.flow, view.alignment.new_from_ref
+        self._follow(kf, view, self._most_matched if kf is self._ref else 0)
         self._last = (work, moving)
-        if self._wants_keyframe(view):
+        if self._wants_keyframe(view) and not self._changes_to_known(work, moving):
             kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
         return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
 
-    def _compare(self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array) -> TwoView:
-        """Predict, mask and align one pair. Tracking, loops and recovery all come here."""
-        graph, started = self.graph, self.graph.initialised
-        block = graph.blocks[ref.id]
-        pair = self.parts.provider.predict(  # III-A: both pointmaps, in ref's camera
-            ref.work,
-            new,
-            Guess(
-                graph.camera(),
-                block.inv_depth if started else None,
-                graph.depth_info(ref.id) if started else None,
-                guess if started else None,
-                flow,
-            ),
-        )
-        weight = pair.matches.weight * ref.static * static_at(prior, pair.matches.new_px)  # (5)(6), softly
-        matches = StaticMatches(
-            block.px, block.inv_depth, graph.depth_info(ref.id), pair.matches.new_px, weight, graph.lens.g
-        )
-        if started:
-            alignment = align(  # III-B (7)-(12)
-                pair,
-                matches,
-                guess,
-                self.config.correction,
-                self.config.alignment,
-                self.parts.provider.depth_sigma_ratio,
-            )
-        else:
-            alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
-        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size))
+    def _find(self, work: WorkFrame, prior: Array) -> TwoView | None:
+        """The frame against the keyframe that is followed; a young submap first looks for the map that was lost."""
+        assert self._ref is not None
+        if not self.graph.initialised and self.graph.started:
+            view = self._rejoin(work, prior)
+            if view is not None:
+                return view
+        view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
+        return view if self.comparer.believed(view) else None
 
-    def _believed(self, view: TwoView) -> bool:
-        enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
-        return bool(enough) and view.alignment.inlier_ratio >= self.config.tracking.min_inlier_ratio
-
-    def _retry(self, work: WorkFrame, prior: Array) -> tuple[Keyframe, TwoView]:
-        """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
-        last = self._last
-        if last is not None and self._flow is not None and self.graph.records[-1].state == "tracked":
-            kf = self._promote_last(*last)
-            near = self._compare(kf, work, prior, None, np.eye(4))
-            if self._believed(near):
-                return kf, near
-        latest = self.graph.latest
-        candidates = [latest, *self.parts.places.best(self.graph, work.gray, skip=latest.id)]
-        view: TwoView | None = None
+    def _rejoin(self, work: WorkFrame, prior: Array) -> TwoView | None:
+        """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
+        graph = self.graph
+        ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
+        candidates = self.parts.places.best(graph, work.gray, ids)
+        if self._before_loss is not None:
+            candidates = [self._before_loss, *(kf for kf in candidates if kf.id != self._before_loss.id)]
         for kf in candidates:
-            start = self.parts.features.flow(kf.work.gray, work.gray)
-            if start is None and view is not None:
-                continue
-            view = self._compare(kf, work, prior, start, np.eye(4))
-            if self._believed(view):
+            view = self.comparer.recognised(kf, work, prior)
+            if view is not None:
+                log.info("frame %d found again from keyframe %d", work.index, kf.id)
+                graph.drop_submap()
+                graph.submap = graph.submap_of[kf.id]
+                self._chain.clear()
+                self._follow(kf, view, 0)
+                return view
+        return None
+
+    def _retry(self, work: WorkFrame, prior: Array) -> tuple[Keyframe, TwoView | None]:
+        """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
+        assert self._ref is not None
+        last, graph = self._last, self.graph
+        if last is not None and self._flow is not None and graph.records[-1].state == "tracked":
+            kf = self._promote_last(*last)
+            near = self.comparer.compare(kf, work, prior, None, np.eye(4))
+            if self.comparer.believed(near):
+                return kf, near
+        places = self.parts.places.best(graph, work.gray, graph.members())
+        for kf in [self._ref, *(p for p in places if p.id != self._ref.id)]:
+            view = self.comparer.recognised(kf, work, prior)
+            if view is not None:
                 log.info("frame %d found again from keyframe %d", work.index, kf.id)
                 return kf, view
-        assert view is not None
-        return latest, view
+        return self._ref, None
+
+    def _follow(self, kf: Keyframe, view: TwoView, most_matched: int) -> None:
+        self._ref, self._most_matched = kf, most_matched
+        self._flow, self._cam_from_ref = view.pair.flow, view.alignment.new_from_ref
 
     def close(self) -> None:
-        """After the last frame: make it a keyframe where it has moved on, so that what it alone sees is kept."""
-        if self._last is None or self._flow is None or not self.graph.initialised:
-            return
-        work, moving = self._last
-        view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)
-        if self._believed(view) and view.motion_ratio > 0.3 * self.config.tracking.keyframe_motion_ratio:
-            self._add_keyframe(work, moving, view)
+        """After the last frame: keep what it alone sees, and join the submaps that can be."""
+        graph = self.graph
+        if self._last is not None and self._flow is not None and graph.initialised and self._ref is not None:
+            work, moving = self._last
+            view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
+            enough = 0.3 * self.config.tracking.keyframe_motion_ratio
+            if self.comparer.believed(view) and view.motion_ratio > enough:
+                self._add_keyframe(work, moving, view)
+        if graph.started and graph.keyframes and not graph.initialised and not bootstrap(graph):
+            graph.drop_submap()
+            graph.submap = graph.submap_of[graph.latest.id]
+        for submap in sorted(graph.started)[1:]:
+            graph.submap = submap
+            any(self._joins(graph.keyframes[k]) for k in graph.members())
 
     # -- keyframes -------------------------------------------------------------------------------------------
 
-    def _start(self, work: WorkFrame, prior: Array) -> StepReport:
-        inv_depth, info = own_depth_prior(work, 1.0, self.parts.provider.depth_sigma_ratio)
-        kf = self.graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
-        self.graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
-        self.graph.replace_last_by_keyframe(kf)
-        self.graph.initialised = self.parts.provider.depth_sigma_ratio is not None and bool((info > 1).mean() > 0.1)
-        self._flow, self._cam_from_kf, self._last = None, np.eye(4), (work, prior)
-        return StepReport(work.index, work.timestamp_s, "started", kf.id, True, "first view")
+    def _start(self, work: WorkFrame, prior: Array, why: str) -> StepReport:
+        graph = self.graph
+        sigma = self.parts.provider.depth_sigma_ratio
+        inv_depth, info = own_depth_prior(work, 1.0, sigma)
+        kf = graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
+        graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
+        graph.replace_last_by_keyframe(kf)
+        if sigma is not None and bool((info * inv_depth**2 > 1).mean() > 0.1):
+            graph.started.add(graph.submap)
+        self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
+        self._last = (work, prior)
+        return StepReport(work.index, work.timestamp_s, "started", kf.id, True, why)
+
+    def _start_again(self, work: WorkFrame, prior: Array) -> StepReport:
+        """The camera is lost: what follows is a submap of its own until it is recognised."""
+        graph, ref = self.graph, self._ref
+        why = "the view before it cannot be followed into it, and no keyframe looks like it"
+        log.info("frame %d lost: %s", work.index, why)
+        if graph.initialised:
+            self._before_loss = ref
+        else:
+            graph.drop_submap()
+        self._chain.clear()
+        graph.start_submap()
+        return self._start(work, prior, why)
 
     def _wants_keyframe(self, view: TwoView) -> bool:
         t = self.config.tracking
@@ -187,51 +188,89 @@ class Slam:
         # something that passes in front thins the matches too, but from the same place nothing is gained
         return view.motion_ratio > enough or (thin and view.motion_ratio > 0.4 * enough)
 
+    def _changes_to_known(self, work: WorkFrame, moving: Array) -> bool:
+        """Where an older keyframe sees the same from nearby, frames hang on that one, and nothing is added."""
+        graph, ref, t = self.graph, self._ref, self.config.tracking
+        assert ref is not None
+        if not graph.initialised:
+            return False
+        cam_from_world = self._cam_from_ref @ graph.blocks[ref.id].cam_from_world
+        near = nearest_keyframe(graph, cam_from_world, ref.id, t.known_overlap_ratio, t.known_motion_ratio)
+        if near is None:
+            return False
+        kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.blocks[near].cam_from_world)
+        view = self.comparer.compare(kf, work, moving, rigid_flow_to(graph, near, cam_from_world), guess)
+        share = view.matched / max(int((kf.work.texture * kf.static > 0.05).sum()), 1)
+        if not self.comparer.believed(view) or view.motion_ratio > t.keyframe_motion_ratio or share < 0.4:
+            return False
+        if abs(near - ref.id) > 1 and not graph.connected(near, ref.id) and self._connect_both(near, ref.id):
+            log.info("keyframes %d and %d see the same place", near, ref.id)
+            graph.solve_all(4, 1.0)
+        self._follow(kf, view, view.matched)
+        return True
+
     def _promote_last(self, work: WorkFrame, moving: Array) -> Keyframe:
-        prior_view = self._compare(self.graph.latest, work, moving, self._flow, self._cam_from_kf)
+        assert self._ref is not None
+        prior_view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
         return self._add_keyframe(work, moving, prior_view)
 
     def _add_keyframe(self, work: WorkFrame, moving: Array, view: TwoView) -> Keyframe:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
-        graph, before = self.graph, self.graph.latest
+        graph, before = self.graph, self._ref
+        assert before is not None
         cam_from_world = view.alignment.new_from_ref @ graph.blocks[before.id].cam_from_world
-        inv_depth, info = predicted_depth(
-            graph,
-            before.id,
-            cam_from_world,
-            work,
-            view.alignment.scale,
-            self.parts.provider.depth_sigma_ratio,
-        )
+        sigma = self.parts.provider.depth_sigma_ratio
+        inv_depth, info = predicted_depth(graph, before.id, cam_from_world, work, view.alignment.scale, sigma)
         kf = graph.add_keyframe(work, static_at(moving, work.px), moving, cam_from_world, inv_depth, info)
         graph.replace_last_by_keyframe(kf)
         graph.connect(before.id, kf.id, view.pair.matches, static_at(moving, view.pair.matches.new_px))
         self._chain[before.id, kf.id] = view.pair.flow
         self._connect(kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
-        for k in range(before.id - 1, max(-1, kf.id - 1 - self.config.graph.neighbours), -1):
+        recent = [k for k in graph.members()[-2 - self.config.graph.neighbours : -1] if k != before.id]
+        for k in reversed(recent):
             self._connect_both(k, kf.id)
+        self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
+        self._last = (work, moving)
         if not graph.initialised:
-            if len(graph.keyframes) >= self.config.graph.bootstrap_keyframes:
-                bootstrap(graph)
+            if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
                 self._chain.clear()
         else:
-            older = covisible(
-                graph,
-                kf.id,
-                kf.id - self.config.graph.neighbours,
-                self.config.graph.covisible,
-                self.config.graph.loop_overlap_ratio,
-            )
-            for k in older:
-                self._connect_both(k, kf.id)
-            graph.solve_window()
-            if len(graph.keyframes) in (10, 16, 24, 40, 64, 100, 160, 256):
-                graph.solve_all(6, 1.0)
-        self._flow, self._cam_from_kf, self._most_matched = None, np.eye(4), 0
-        self._last = (work, moving)
+            self._extend(kf, min(recent, default=before.id))
         return kf
 
-    def _connect_both(self, i: int, j: int) -> None:
+    def _extend(self, kf: Keyframe, recent_from: int) -> None:
+        """Older keyframes that see the same place, the window, and now and then everything."""
+        graph, c = self.graph, self.config.graph
+        for k in covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio):
+            self._connect_both(k, kf.id)
+        graph.solve_window()
+        joined = len(graph.started) > 1 and self._joins(kf)
+        if not joined and len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256):
+            graph.solve_all(6, 1.0)
+
+    def _joins(self, kf: Keyframe) -> bool:
+        """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
+        graph = self.graph
+        own = graph.submap_of[kf.id]
+        others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
+        for other in self.parts.places.best(graph, kf.work.gray, others):
+            view = self.comparer.recognised(other, kf.work, kf.moving / 255.0)
+            if view is None:
+                continue
+            pose = view.alignment.new_from_ref
+            scale = scale_between(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
+            if scale is None:
+                continue
+            log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
+            join(graph, other.id, kf.id, pose, scale)
+            for k in range(max(0, other.id - 2), min(len(graph.keyframes), other.id + 3)):
+                if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:
+                    self._connect_both(k, kf.id)
+            graph.solve_all(10, 2.0)
+            return True
+        return False
+
+    def _connect_both(self, i: int, j: int) -> bool:
         grid_px = self.parts.grid_px
         if self.graph.initialised:
             start, back = rigid_flow(self.graph, i, j), rigid_flow(self.graph, j, i)
@@ -239,9 +278,8 @@ class Slam:
             start = chained_flow(self._chain[i, j - 1], self._chain[j - 1, j], grid_px)
             back = invert_flow(start, grid_px)
         else:
-            return
-        if self._connect(i, j, start):
-            self._connect(j, i, back)
+            return False
+        return self._connect(i, j, start) and self._connect(j, i, back)
 
     def _connect(self, i: int, j: int, flow: Array) -> bool:
         ref, new = self.graph.keyframes[i], self.graph.keyframes[j]
@@ -259,18 +297,9 @@ class Slam:
         return grown(self.belief.update(given).probability)
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
-        if self.graph.keyframes and not self.graph.initialised:
-            self.graph.clear()
-        latest = self.graph.latest.id if self.graph.keyframes else 0
-        self.graph.record(work, latest, self._cam_from_kf, "lost", None, np.zeros(0))
+        """Nothing can be seen: the frame has no place, and the next one is looked for where the last one was."""
+        ref = self._ref.id if self._ref is not None else 0
+        self.graph.record(work, ref, self._cam_from_ref, "lost", None, np.zeros(0))
         self._flow, self._last = None, None
         log.warning("frame %d lost: %s", work.index, why)
-        return StepReport(work.index, work.timestamp_s, "lost", latest, False, why)
-
-
-def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:
-    used = weight > 0.05
-    if used.sum() < 10:
-        return float("inf"), 0
-    moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
-    return float(np.quantile(moved, 0.75)) / float(np.sqrt(size[0] * size[1])), int(used.sum())
+        return StepReport(work.index, work.timestamp_s, "lost", ref, False, why)

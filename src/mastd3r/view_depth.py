@@ -79,11 +79,16 @@ def predicted_depth(
 
 
 def rigid_flow(graph: KeyframeGraph, i: int, j: int) -> Array:
-    """(h, w, 2) flow i -> j that the graph's poses and depths predict; computed a cell, interpolated between."""
+    """(h, w, 2) flow i -> j that the graph's poses and depths predict."""
+    return rigid_flow_to(graph, i, graph.blocks[j].cam_from_world)
+
+
+def rigid_flow_to(graph: KeyframeGraph, i: int, cam_from_world: Array) -> Array:
+    """(h, w, 2) flow of a static scene from keyframe i into a view; computed a cell, interpolated between."""
     kf, block, camera = graph.keyframes[i], graph.blocks[i], graph.camera()
     inv_depth = filled(block.inv_depth, graph.depth_info(i), kf.work.grid)
     centres = cell_centres(kf.work.grid, *graph.size)
-    j_from_i = graph.blocks[j].cam_from_world @ inverse(block.cam_from_world)
+    j_from_i = cam_from_world @ inverse(block.cam_from_world)
     points = transform(j_from_i, camera.rays(centres) / np.maximum(inv_depth, 1e-6)[:, None])
     points[:, 2] = np.maximum(points[:, 2], 1e-2 / float(np.median(inv_depth)))
     limit = 2.0 * max(graph.size)

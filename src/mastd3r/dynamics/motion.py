@@ -34,9 +34,10 @@ def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Arr
     x, y = x * scale, y * scale
     dx, dy = (m[0, 3] - x * m[2, 3]) * scale, (m[1, 3] - y * m[2, 3]) * scale
     u, v = x, y
-    if camera.k1 != 0.0:
-        bend = 1 + camera.k1 * (x * x + y * y)
-        pull = 2 * camera.k1 * (x * dx + y * dy)
+    if camera.bent:
+        r2 = x * x + y * y
+        bend = 1 + r2 * (camera.k1 + r2 * (camera.k2 + camera.k3 * r2))
+        pull = 2 * (camera.k1 + r2 * (2 * camera.k2 + 3 * camera.k3 * r2)) * (x * dx + y * dy)
         dx, dy = dx * bend + x * pull, dy * bend + y * pull
         u, v = x * bend, y * bend
     target = cv2.merge([u * camera.fx_px + camera.cx_px, v * camera.fy_px + camera.cy_px])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -81,23 +81,30 @@ def _write_colmap(run: Run, out: Path) -> None:
     cloud = read_cloud(run.path / "cloud.ply")
     with writing(out):
         out.mkdir(exist_ok=True)
-    write_text(out / "cameras.txt", cameras_text(run.camera))
+    write_text(out / "cameras.txt", cameras_text(run.camera, run.distortion))
     write_text(out / "images.txt", images_text(run.trajectory))
     chosen = evenly(len(cloud.points_world), MAX_POINTS)
     write_text(out / "points3D.txt", points_text(cloud.points_world[chosen], cloud.colors[chosen]))
 
 
-def cameras_text(camera: Camera) -> str:
-    """cameras.txt with the one full-size lens: SIMPLE_RADIAL, or OPENCV where fx and fy differ.
+def cameras_text(camera: Camera, distortion: Sequence[float] = ()) -> str:
+    """cameras.txt with the one full-size lens: the simplest model that holds it.
 
+    ``distortion`` (k1 k2 p1 p2 [k3 [k4 k5 k6]]) goes before the camera's own terms; COLMAP's order is OpenCV's.
     COLMAP's first pixel spans 0 to 1, so that its centre is (0.5, 0.5); ours is (0, 0): half a pixel is added.
     """
     c = camera
     centre = [c.cx_px + 0.5, c.cy_px + 0.5]
-    if abs(c.fx_px - c.fy_px) <= SAME_FOCAL_RATIO * c.fx_px:
-        model, parameters = "SIMPLE_RADIAL", [c.fx_px, *centre, c.k1]
+    k1, k2, p1, p2, k3, *rational = (*(distortion or (c.k1, c.k2, 0.0, 0.0, c.k3)), *(0.0,) * 8)[:8]
+    same = abs(c.fx_px - c.fy_px) <= SAME_FOCAL_RATIO * c.fx_px
+    if k3 != 0.0 or any(rational):
+        model, parameters = "FULL_OPENCV", [c.fx_px, c.fy_px, *centre, k1, k2, p1, p2, k3, *rational]
+    elif not same or p1 != 0.0 or p2 != 0.0:
+        model, parameters = "OPENCV", [c.fx_px, c.fy_px, *centre, k1, k2, p1, p2]
+    elif k2 == 0.0:
+        model, parameters = "SIMPLE_RADIAL", [c.fx_px, *centre, k1]
     else:
-        model, parameters = "OPENCV", [c.fx_px, c.fy_px, *centre, c.k1, 0.0, 0.0, 0.0]
+        model, parameters = "RADIAL", [c.fx_px, *centre, k1, k2]
     words = [str(COLMAP_CAMERA_ID), model, str(c.width), str(c.height), *_numbers(parameters)]
     return "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n" + " ".join(words) + "\n"
 

@@ -30,6 +30,7 @@ class Run:
     metrics: dict[str, Any]
     config: str
     camera: Camera | None
+    distortion: tuple[float, ...] = ()  # of the camera, OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]]
 
     def mask_times_s(self) -> Array:
         """(n,) times of the frames that have a mask."""
@@ -63,13 +64,15 @@ def read_run(path: Path | str) -> Run:
     if "states" in record:
         trajectory = replace(trajectory, states=_states(record["states"], trajectory, folder))
     camera_file, config_file = folder / "camera.json", folder / "config.yaml"
+    camera, distortion = _camera(camera_file) if camera_file.is_file() else (None, ())
     return Run(
         path=folder,
         trajectory=trajectory,
         record=record,
         metrics=read_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {},
         config=config_file.read_text() if config_file.is_file() else "",
-        camera=_camera(camera_file) if camera_file.is_file() else None,
+        camera=camera,
+        distortion=distortion,
     )
 
 
@@ -93,10 +96,13 @@ def _states(runs: Any, trajectory: Trajectory, folder: Path) -> tuple[State, ...
     return states
 
 
-def _camera(path: Path) -> Camera:
+def _camera(path: Path) -> tuple[Camera, tuple[float, ...]]:
+    """The camera and its whole distortion; empty where camera.json has no such list."""
+    data = read_json(path)
     try:
-        return Camera(**read_json(path))
-    except TypeError as e:
+        distortion = tuple(float(v) for v in data.pop("distortion", []))
+        return Camera(**data), distortion
+    except (TypeError, ValueError) as e:
         raise InputError(f"{path}: expected the fields of a camera, got {e}") from e
 
 

@@ -74,7 +74,7 @@ def report_html(data: ReportData) -> str:
         _renders(data.renders),
         _masks(data.masks),
         _trajectory(data),
-        _numbers(data.metrics),
+        _numbers(data.metrics, data.record.get("camera") or {}),
         _timings(data.record.get("timings_s") or {}),
         _choices(data),
     ]
@@ -168,18 +168,37 @@ def _legend(data: ReportData, has_truth: bool) -> str:
     return f'<div class="legend">{"".join(items)}</div>'
 
 
-def _numbers(metrics: Mapping[str, Any]) -> str:
+def _numbers(metrics: Mapping[str, Any], camera: Mapping[str, Any]) -> str:
     if not metrics:
         return ""
-    rows = [f"<tr><td>{escape(described(key))}</td>{_value_cell(key, value)}</tr>" for key, value in in_order(metrics)]
+    rows = []
+    for key, value in in_order(metrics):
+        of_name, of_value = _of_focal(camera) if key == "focal_px" and value is not None else ("", "")
+        name, cell = escape(described(key) + of_name), _value_cell(key, value, of_value)
+        rows.append(f"<tr><td>{name}</td>{cell}</tr>")
     half = (len(rows) + 1) // 2
     tables = "".join(f"<table>{''.join(part)}</table>" for part in (rows[:half], rows[half:]) if part)
     return _section("Figures", "", f'<div class="row two">{tables}</div>')
 
 
-def _value_cell(key: str, value: Any) -> str:
+def _value_cell(key: str, value: Any, addition: str = "") -> str:
     kind = "value text" if isinstance(value, str) else "value"
-    return f'<td class="{kind}">{escape(shown(key, value))}</td>'
+    return f'<td class="{kind}">{escape(shown(key, value) + addition)}</td>'
+
+
+def _of_focal(camera: Mapping[str, Any]) -> tuple[str, str]:
+    """What is added to the focal length's name and value, from the camera section of run.json.
+
+    The solver's sigma counts every match as independent noise of one pixel, and is named as such.
+    """
+    sigma_ratio = camera.get("focal_sigma_ratio")
+    if camera.get("found") == "given":
+        return ", given", ""
+    if sigma_ratio is None:
+        return "", ""
+    percent = 100 * sigma_ratio
+    digits = "under 0.01" if percent < 0.01 else f"{percent:.2g}" if percent < 10 else f"{percent:.0f}"
+    return " (1σ if match errors were independent)", f" ± {digits} %"
 
 
 def _timings(timings_s: Mapping[str, float]) -> str:

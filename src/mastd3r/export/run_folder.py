@@ -94,9 +94,14 @@ class RunFolder:
         states = [state for state, pose in pairs if np.isfinite(pose).all()]
         self.update(states=_run_lengths(states))
 
-    def write_camera(self, camera: Camera) -> None:
-        """camera.json: the lens, in pixels of the full-size image."""
-        self.write_json("camera.json", dataclasses.asdict(camera))
+    def write_camera(self, camera: Camera, distortion: Sequence[float] | None = None) -> None:
+        """camera.json: the lens, in pixels of the full-size image, and its distortion in OpenCV's order.
+
+        ``distortion`` holds what ``camera`` cannot (k1 k2 p1 p2 [k3 [k4 k5 k6]]); without it, the camera's own terms.
+        """
+        own = (camera.k1, camera.k2, 0.0, 0.0, camera.k3)
+        distorted = list(own if distortion is None else distortion)
+        self.write_json("camera.json", {**dataclasses.asdict(camera), "distortion": distorted})
 
     def write_cloud(self, cloud: StaticCloud) -> None:
         """cloud.ply: the dense static map."""

@@ -1,4 +1,4 @@
-"""Pinhole camera with one radial term, OpenCV axes, integer pixel = pixel centre."""
+"""Pinhole camera with three radial terms, OpenCV axes, integer pixel = pixel centre."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Camera:
-    """Focal lengths, principal point and one radial term: x_d = x·(1 + k1·|x|²) on the unit plane."""
+    """Focal lengths, principal point and radial terms: x_d = x·(1 + k1·|x|² + k2·|x|⁴ + k3·|x|⁶)."""
 
     fx_px: float
     fy_px: float
@@ -22,6 +22,8 @@ class Camera:
     width: int
     height: int
     k1: float = 0.0
+    k2: float = 0.0
+    k3: float = 0.0
 
     @staticmethod
     def centred(focal_px: float, width: int, height: int, k1: float = 0.0) -> Camera:
@@ -35,8 +37,13 @@ class Camera:
 
     @property
     def pinhole(self) -> Camera:
-        """The same camera without its radial term."""
-        return replace(self, k1=0.0)
+        """The same camera without its radial terms."""
+        return replace(self, k1=0.0, k2=0.0, k3=0.0)
+
+    @property
+    def bent(self) -> bool:
+        """True where straight lines are not imaged straight."""
+        return self.k1 != 0.0 or self.k2 != 0.0 or self.k3 != 0.0
 
     def resized(self, width: int, height: int) -> Camera:
         """The same lens over an image scaled to (width, height); half pixels are honoured."""
@@ -49,6 +56,8 @@ class Camera:
             width,
             height,
             self.k1,
+            self.k2,
+            self.k3,
         )
 
     def padded(self, pad_px: int) -> Camera:
@@ -64,16 +73,18 @@ class Camera:
     def project(self, points_cam: Array) -> Array:
         """(..., 3) points with z > 0 to (..., 2) pixels."""
         xy = points_cam[..., :2] / points_cam[..., 2:]
-        xy = xy * (1 + self.k1 * (xy**2).sum(-1, keepdims=True))
+        r2 = (xy**2).sum(-1, keepdims=True)
+        xy = xy * (1 + r2 * (self.k1 + r2 * (self.k2 + self.k3 * r2)))
         return xy * np.array([self.fx_px, self.fy_px]) + np.array([self.cx_px, self.cy_px])
 
     def rays(self, px: Array) -> Array:
         """(..., 2) pixels to (..., 3) rays with z = 1 (fixed-point undistortion, 10 rounds)."""
         xd = (np.asarray(px, float) - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
         x = xd
-        if self.k1 != 0.0:
+        if self.bent:
             for _ in range(10):
-                x = xd / (1 + self.k1 * (x**2).sum(-1, keepdims=True))
+                r2 = (x**2).sum(-1, keepdims=True)
+                x = xd / (1 + r2 * (self.k1 + r2 * (self.k2 + self.k3 * r2)))
         return np.concatenate([x, np.ones_like(x[..., :1])], -1)
 
     def pixel_grid(self) -> Array:

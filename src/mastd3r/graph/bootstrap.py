@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.reprojection import edge_residuals
+from ..geometry.reprojection import N_GLOBAL, edge_residuals
 from ..geometry.se3 import inverse
 from .bundle import Edge, Lens, solve
 from .depth import carried
@@ -22,12 +22,15 @@ FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the lens is not given
 
 
-def bootstrap(graph: KeyframeGraph) -> bool:
-    """Solve all keyframes of a graph that has none solved yet. False where no start was found (too little parallax).
+def bootstrap(whole: KeyframeGraph) -> bool:
+    """Solve all keyframes of the submap being tracked. False where no start was found (too little parallax).
 
     Several first pairs and focal lengths are tried, each to the end; the start that explains the matches best is
-    kept. World is the first keyframe's camera.
+    kept. World is the submap's first keyframe's camera. A lens that an earlier submap has found stays as it is.
     """
+    graph = whole.part()
+    if whole.started:
+        graph.lens = Lens(whole.lens.g, whole.lens.g, np.full(N_GLOBAL, np.inf))
     ratios = FOCAL_RATIOS if graph.lens.free[0] else (None,)
     best: tuple[float, Array, dict[int, tuple[Array, Array]]] | None = None
     for pair in _first_pairs(graph):
@@ -42,7 +45,7 @@ def bootstrap(graph: KeyframeGraph) -> bool:
     if best is None:
         return False
     graph.lens.g = best[1]
-    world_from_first = inverse(best[2][0][0])
+    world_from_first = inverse(best[2][min(best[2])][0])
     for k, (pose, depth) in best[2].items():
         graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose @ world_from_first, depth
     agreeing = _agreement(graph)
@@ -50,7 +53,8 @@ def bootstrap(graph: KeyframeGraph) -> bool:
         log.info("no start: only %.0f %% of the matches fit one camera and one static scene", 100 * agreeing)
         return False
     graph.normalise()
-    graph.initialised = True
+    whole.lens.g = graph.lens.g
+    whole.started.add(whole.submap)
     log.info("started with %d keyframes, focal %.0f px at working size", len(graph.keyframes), np.exp(graph.lens.g[0]))
     return True
 
@@ -84,7 +88,7 @@ def _attempt(graph: KeyframeGraph, lens: Lens, pair: Edge) -> float | None:
     _reset(graph)
     if not _two_view(graph, lens, pair):
         return None
-    frozen = Lens(lens.g, lens.prior, np.full(4, np.inf))
+    frozen = Lens(lens.g, lens.prior, np.full(N_GLOBAL, np.inf))
     done = [pair.i, pair.j]
     _solve_part(graph, frozen, done, frozenset([pair.i]), 15, 2.0)
     while len(done) < len(graph.keyframes):
@@ -96,8 +100,10 @@ def _attempt(graph: KeyframeGraph, lens: Lens, pair: Edge) -> float | None:
         _solve_part(graph, frozen, done, frozenset(done[:-1]), 15, 4.0)
         _carry(graph, lens, nearest, k)
         _solve_part(graph, frozen, done, frozenset([pair.i]), 6, 2.0)
-    only_focal = Lens(lens.g, lens.prior, np.where(np.arange(4) == 0, lens.prior_info, np.inf))
-    report = solve(graph.blocks, graph.edges, only_focal, fixed=frozenset([0]), iterations=25, kernel_px=1.0)
+    only_focal = Lens(lens.g, lens.prior, np.where(np.arange(N_GLOBAL) == 0, lens.prior_info, np.inf))
+    report = solve(
+        graph.blocks, graph.edges, only_focal, fixed=frozenset([min(graph.blocks)]), iterations=25, kernel_px=1.0
+    )
     lens.g = only_focal.g
     return report.cost_last if np.isfinite(report.cost_last) else None
 

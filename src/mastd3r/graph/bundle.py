@@ -1,7 +1,7 @@
 """Joint optimisation of keyframe poses, inverse depths and intrinsics from flow matches (docs/joint_optimisation.md).
 
 Levenberg-Marquardt; depths are eliminated by the Schur complement, host by host, so the dense system that is solved
-has 6 rows a keyframe and 4 for the lens.
+has 6 rows a keyframe and 6 for the lens.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ class Edge:
 
 @dataclass
 class Lens:
-    """Shared intrinsics g = (log f, k, cx, cy) at the working resolution, with a Gaussian prior on each."""
+    """Shared intrinsics g = (log f, k, cx, cy, m, n) at the working resolution, with a Gaussian prior on each."""
 
-    g: Array  # (4,)
-    prior: Array  # (4,)
-    prior_info: Array  # (4,) 1/variance in px^-2 units; inf = fixed
+    g: Array  # (6,)
+    prior: Array  # (6,)
+    prior_info: Array  # (6,) 1/variance in px^-2 units; inf = fixed
 
     @property
     def free(self) -> Array:
-        """(4,) bool, which intrinsics are estimated."""
+        """(6,) bool, which intrinsics are estimated."""
         return np.isfinite(self.prior_info)
 
 

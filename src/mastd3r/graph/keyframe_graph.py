@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from ..config import CameraConfig, GraphConfig
 from ..geometry.camera import Camera
+from ..geometry.reprojection import N_GLOBAL
 from ..geometry.se3 import inverse
 from ..types import Matches, State, WorkFrame
 from .bundle import Block, Edge, Lens, SolveReport, solve
 
 Array = NDArray[Any]
 PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
-PRIOR_RADIAL_SIGMA = 0.05
+PRIOR_RADIAL_SIGMA = (0.05, 0.1, 0.1)  # of k, m, n
+PRIOR_CENTRE_SIGMA = 0.02  # of the principal point from the image's centre / width
+RADIAL, LATE = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what waits for lens_keyframes
 PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
@@ -50,14 +53,16 @@ class FrameRecord:
 class KeyframeGraph:
     """Keyframes and what holds them together. Lengths are map units, pixels are at working size."""
 
-    def __init__(self, config: GraphConfig, camera: CameraConfig, lens: Lens) -> None:
-        self.config, self.camera_config, self.lens = config, camera, lens
+    def __init__(self, config: GraphConfig, lens: Lens) -> None:
+        self.config, self.lens = config, lens
         self.size = (0, 0)
         self.keyframes: list[Keyframe] = []
         self.blocks: dict[int, Block] = {}
         self.edges: list[Edge] = []
         self.records: list[FrameRecord] = []
-        self.initialised = False
+        self.submap = 0  # the one being tracked
+        self.submap_of: dict[int, int] = {}
+        self.started: set[int] = set()  # submaps that have poses and depths
         self.last_report: SolveReport | None = None
 
     # -- reading ---------------------------------------------------------------------------------------------
@@ -66,6 +71,20 @@ class KeyframeGraph:
     def latest(self) -> Keyframe:
         """The newest keyframe."""
         return self.keyframes[-1]
+
+    @property
+    def initialised(self) -> bool:
+        """True where the submap being tracked has poses and depths."""
+        return self.submap in self.started
+
+    def members(self, submap: int | None = None) -> list[int]:
+        """Keyframes of a submap (of the one being tracked by default), oldest first."""
+        wanted = self.submap if submap is None else submap
+        return [kf.id for kf in self.keyframes if self.submap_of[kf.id] == wanted]
+
+    def roots(self) -> list[int]:
+        """The first keyframe of every submap: they do not move."""
+        return sorted({s: k for k, s in sorted(self.submap_of.items(), reverse=True)}.values())
 
     def camera(self) -> Camera:
         """The lens at working size."""
@@ -101,6 +120,7 @@ class KeyframeGraph:
         kf = Keyframe(len(self.keyframes), work, static, np.rint(255 * moving).astype(np.uint8))
         self.size = (work.gray.shape[1], work.gray.shape[0])
         self.keyframes.append(kf)
+        self.submap_of[kf.id] = self.submap
         self.blocks[kf.id] = Block(work.px, inv_depth, inv_depth.copy(), prior_info, cam_from_world)
         return kf
 
@@ -147,27 +167,48 @@ class KeyframeGraph:
             last.index, last.timestamp_s, kf.id, np.eye(4), last.state, *_nothing(), is_keyframe=True
         )
 
-    def clear(self) -> None:
-        """Forget everything but the frames seen, which become lost: the first view could not be followed."""
-        self.keyframes, self.edges = [], []
-        self.blocks = {}
+    def start_submap(self) -> None:
+        """What comes next is not connected to what is there, until it is recognised."""
+        self.submap = 1 + max(self.submap_of.values(), default=-1)
+
+    def drop_submap(self) -> None:
+        """Forget the keyframes of the submap being tracked, the newest; its frames become lost."""
+        gone = set(self.members())
+        self.keyframes = [kf for kf in self.keyframes if kf.id not in gone]
+        assert all(n == kf.id for n, kf in enumerate(self.keyframes))
+        self.edges = [e for e in self.edges if e.i not in gone and e.j not in gone]
+        for k in gone:
+            del self.blocks[k], self.submap_of[k]
         for r in self.records:
-            r.state, r.is_keyframe, r.kf_id = "lost", False, 0
+            if r.kf_id in gone:
+                r.state, r.is_keyframe, r.kf_id = "lost", False, max(len(self.keyframes) - 1, 0)
+                r.points, r.target, r.weight = _nothing()
+        self.started.discard(self.submap)
+
+    def part(self) -> KeyframeGraph:
+        """The submap being tracked as a graph by itself, sharing keyframes, blocks, edges and records."""
+        ids = set(self.members())
+        out = KeyframeGraph(self.config, self.lens)
+        out.size, out.submap = self.size, self.submap
+        out.keyframes = [kf for kf in self.keyframes if kf.id in ids]
+        out.blocks = {k: self.blocks[k] for k in sorted(ids)}
+        out.submap_of = dict.fromkeys(sorted(ids), self.submap)
+        out.edges = self.edges_among(ids)
+        out.records = [r for r in self.records if r.kf_id in ids]
+        return out
 
     # -- optimisation ----------------------------------------------------------------------------------------
 
     def solve_window(self) -> SolveReport:
         """The last ``window`` keyframes move, everything they are matched with holds them."""
-        n, size = len(self.keyframes), self.config.window
-        active = set(range(max(0, n - size), n))
+        ids, size = self.members(), self.config.window
+        n, active = len(ids), set(ids[-size:])
         edges = [e for e in self.edges if e.i in active]
         near = active | {e.j for e in edges}
         whole = len(near) == n and n <= size
-        fixed = frozenset([0]) if whole else frozenset((near - active) | {min(active)})
-        free = self.lens.prior_info if n <= 2 * size or n % 4 == 0 else np.full(4, np.inf)
-        if n < self.config.radial_keyframes:  # too little seen to tell k from everything else
-            free = np.where(np.arange(4) == 1, np.inf, free)
-        lens = Lens(self.lens.g, self.lens.prior, free)
+        fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
+        moves = n <= 2 * size or n % 4 == 0
+        lens = self._lens_with(() if moves else range(N_GLOBAL))
         report = solve(
             {k: self.blocks[k] for k in sorted(near)},
             edges,
@@ -176,24 +217,36 @@ class KeyframeGraph:
             iterations=self.config.window_iterations * (2 if whole else 1),
         )
         self.lens.g = lens.g
-        if whole:
+        if whole and self.submap == 0:
             self.normalise()
         return report
 
     def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
-        """Every keyframe moves but the first."""
+        """Every keyframe moves but the first of each submap."""
+        lens = self._lens_with(())
         report = solve(
             self.blocks,
             self.edges,
-            self.lens,
-            fixed=frozenset([0]),
+            lens,
+            fixed=frozenset(self.roots()),
             iterations=iterations,
             kernel_px=kernel_px,
             tolerance=1e-5,
         )
+        self.lens.g = lens.g
         self.normalise()
         self.last_report = report
         return report
+
+    def _lens_with(self, fixed: Iterable[int]) -> Lens:
+        """The lens with some unknowns fixed: those named, and those that too few views cannot tell apart."""
+        hold = set(fixed)
+        if len(self.keyframes) < self.config.radial_keyframes:
+            hold |= set(RADIAL)
+        if len(self.keyframes) < self.config.lens_keyframes:
+            hold |= set(LATE)
+        info = np.where(np.isin(np.arange(N_GLOBAL), list(hold)), np.inf, self.lens.prior_info)
+        return Lens(self.lens.g, self.lens.prior, info)
 
     def normalise(self) -> None:
         """Monocular scale is free: keep the median inverse depth of the first three keyframes at one.
@@ -215,6 +268,10 @@ class KeyframeGraph:
             r.cam_from_kf = r.cam_from_kf.copy()
             r.cam_from_kf[:3, 3] *= m
 
+    def connected(self, i: int, j: int) -> bool:
+        """True where matches of one in the other are edges."""
+        return any({e.i, e.j} == {i, j} for e in self.edges)
+
     def edges_among(self, ids: Iterable[int]) -> list[Edge]:
         """Edges with both ends in ``ids``."""
         inside = set(ids)
@@ -226,25 +283,25 @@ def _nothing() -> tuple[Array, Array, Array]:
 
 
 def camera_of(lens: Lens, size: tuple[int, int]) -> Camera:
-    """The camera (width, height) that a lens stands for; its radial term fitted to the undistortion of the solver."""
-    f, k = float(np.exp(lens.g[0])), float(lens.g[1])
-    return Camera(f, f, float(lens.g[2]), float(lens.g[3]), *size, radial_from_undistortion(f, k, size))
+    """The camera (width, height) that a lens stands for; radial terms fitted to the undistortion of the solver."""
+    f, cx, cy = float(np.exp(lens.g[0])), float(lens.g[2]), float(lens.g[3])
+    return Camera(f, f, cx, cy, *size, *inverse_radial(f, tuple(lens.g[list(RADIAL)]), size))
 
 
-def radial_from_undistortion(focal_px: float, k: float, size: tuple[int, int]) -> float:
-    """k1 of x_d = x (1 + k1 x²) that fits x = x_d (1 + k x_d²) best over the image, by least squares in x_d."""
-    if k == 0.0:
-        return 0.0
-    r_d = np.linspace(0.05, 1.0, 40) * 0.5 * np.hypot(*size) / focal_px
-    r = r_d * (1 + k * r_d**2)
-    return float(((r_d - r) * r**3 * r_d).sum() / (r**6 * r_d).sum())
+def inverse_radial(focal_px: float, terms: tuple[float, ...], size: tuple[int, int]) -> tuple[float, ...]:
+    """(a, b, c) of x = y (1 + a y² + b y⁴ + c y⁶) from those of y = x (1 + …) in ``terms``.
 
-
-def undistortion_from_radial(focal_px: float, k1: float, size: tuple[int, int]) -> float:
-    """k of x = x_d (1 + k x_d²) that fits x_d = x (1 + k1 x²) best over the image: the inverse of the above."""
-    r = np.linspace(0.05, 1.0, 40) * 0.5 * np.hypot(*size) / focal_px
-    r_d = r * (1 + k1 * r**2)
-    return float(((r - r_d) * r_d**3 * r).sum() / (r_d**6 * r).sum())
+    Least squares over radii of the image, weighted to be best in y's pixels; as many terms as are not zero there,
+    so that a lens of one term stays one. Both ways: the solver undistorts, ``Camera`` distorts.
+    """
+    used = max((n + 1 for n, t in enumerate(terms) if t != 0.0), default=0)
+    if used == 0:
+        return 0.0, 0.0, 0.0
+    x = np.linspace(0.05, 1.0, 60) * 0.5 * np.hypot(*size) / focal_px
+    y = x * (1 + sum(t * x ** (2 * n + 2) for n, t in enumerate(terms)))
+    powers = np.stack([y ** (2 * n + 3) for n in range(used)], -1)
+    found = np.linalg.lstsq(powers, x - y, rcond=None)[0]
+    return tuple(float(v) for v in (*found, 0.0, 0.0))[:3]
 
 
 def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int, int]) -> Lens:
@@ -257,9 +314,14 @@ def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int
         c = Camera(fx, fy, cx, cy, *full_size).resized(width, height)
         f = float(np.sqrt(c.fx_px * c.fy_px))
         k1 = camera.intrinsics[4] if len(camera.intrinsics) > 4 else 0.0
-        k = undistortion_from_radial(f, k1, (width, height))
-        g = np.array([np.log(f), k, c.cx_px, c.cy_px])
-        return Lens(g, g.copy(), np.full(4, np.inf))
-    g = np.array([np.log(PRIOR_FOCAL_RATIO * np.sqrt(width * height)), 0.0, (width - 1) / 2, (height - 1) / 2])
-    radial = PRIOR_GAIN / PRIOR_RADIAL_SIGMA**2 if camera.estimate_radial else np.inf
-    return Lens(g, g.copy(), np.array([PRIOR_GAIN / PRIOR_FOCAL_SIGMA**2, radial, np.inf, np.inf]))
+        k, m, n = inverse_radial(f, (k1, 0.0, 0.0), (width, height))
+        g = np.array([np.log(f), k, c.cx_px, c.cy_px, m, n])
+        return Lens(g, g.copy(), np.full(N_GLOBAL, np.inf))
+    focal = PRIOR_FOCAL_RATIO * np.sqrt(width * height)
+    g = np.array([np.log(focal), 0.0, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0])
+    centre = PRIOR_CENTRE_SIGMA * width
+    sigma = np.array([PRIOR_FOCAL_SIGMA, PRIOR_RADIAL_SIGMA[0], centre, centre, *PRIOR_RADIAL_SIGMA[1:]])
+    info = PRIOR_GAIN / sigma**2
+    if not camera.estimate_radial:
+        info[1:] = np.inf
+    return Lens(g, g.copy(), info)

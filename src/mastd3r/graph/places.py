@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import cv2
@@ -32,7 +33,9 @@ def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_over
     """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours."""
     pose = graph.blocks[kf_id].cam_from_world
     found = []
-    for k in range(before):
+    for k in graph.members():
+        if k >= before:
+            break
         share, motion = overlap(graph, k, pose)
         if share >= min_overlap and motion < 0.5:
             found.append((motion, k))
@@ -43,6 +46,20 @@ def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_over
         if all(abs(k - c) > 1 for c in chosen):
             chosen.append(k)
     return chosen
+
+
+def nearest_keyframe(
+    graph: KeyframeGraph, cam_from_world: Array, but: int, min_overlap: float, max_motion: float
+) -> int | None:
+    """The keyframe of the submap being tracked, other than ``but``, with the least image motion to a view."""
+    best = None
+    for k in graph.members():
+        if k == but:
+            continue
+        share, motion = overlap(graph, k, cam_from_world)
+        if share >= min_overlap and motion <= max_motion and (best is None or motion < best[0]):
+            best = (motion, k)
+    return None if best is None else best[1]
 
 
 def thumbnail(gray: Array) -> Array:
@@ -56,15 +73,16 @@ class PlaceIndex:
     """Place recognition: keyframes whose thumbnails look most alike. Nothing is believed before it is verified."""
 
     def __init__(self) -> None:
-        self._known: list[Array] = []
+        self._known: dict[int, tuple[int, Array]] = {}  # keyframe: (frame, thumbnail)
 
-    def best(self, graph: KeyframeGraph, gray: Array, skip: int, count: int = 3) -> list[Keyframe]:
-        """Up to ``count`` keyframes that look most like ``gray``, without ``skip``."""
-        del self._known[len(graph.keyframes) :]
-        for kf in graph.keyframes[len(self._known) :]:
-            self._known.append(thumbnail(kf.work.gray))
-        if not self._known:
+    def best(self, graph: KeyframeGraph, gray: Array, among: Collection[int], count: int = 3) -> list[Keyframe]:
+        """Up to ``count`` keyframes of ``among`` that look most like ``gray``, best first."""
+        if not among:
             return []
-        likeness = np.stack(self._known) @ thumbnail(gray)
-        order = [int(k) for k in np.argsort(-likeness, kind="stable") if k != skip]
-        return [graph.keyframes[k] for k in order[:count]]
+        for k in among:
+            work = graph.keyframes[k].work
+            if k not in self._known or self._known[k][0] != work.index:
+                self._known[k] = (work.index, thumbnail(work.gray))
+        ids = sorted(among)
+        likeness = np.stack([self._known[k][1] for k in ids]) @ thumbnail(gray)
+        return [graph.keyframes[ids[n]] for n in np.argsort(-likeness, kind="stable")[:count]]

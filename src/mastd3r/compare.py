@@ -1,0 +1,76 @@
+"""One pair, compared: pointmaps, mask and pose. Tracking, loops, recovery and joining all come here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .alignment.align import align
+from .alignment.reproject import StaticMatches
+from .alignment.result import Alignment
+from .config import Config
+from .graph.keyframe_graph import Keyframe, KeyframeGraph
+from .parts import Parts
+from .types import Guess, Matches, PairPrediction, WorkFrame
+from .view_depth import static_at
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class TwoView:
+    """One pair, compared: what the provider said, the static weight of its matches, and the pose."""
+
+    pair: PairPrediction
+    weight: Array  # (p,) static weight of each match
+    alignment: Alignment
+    motion_ratio: float  # upper quartile of the image motion / sqrt(width * height)
+    matched: int  # weighted matches
+
+
+class Comparer:
+    """The front end for one pair: a keyframe, whose depths the graph knows, and a frame."""
+
+    def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph) -> None:
+        self.config, self.parts, self.graph = config, parts, graph
+
+    def compare(self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array) -> TwoView:
+        """``prior`` (h, w) P(moving) in new; ``flow`` (h, w, 2) start ref -> new; ``guess`` (4, 4) new_from_ref."""
+        graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
+        block = graph.blocks[ref.id]
+        inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow)
+        pair = self.parts.provider.predict(ref.work, new, known)  # III-A: both pointmaps, in ref's camera
+        weight = pair.matches.weight * ref.static * static_at(prior, pair.matches.new_px)  # (5)(6), softly
+        if started:
+            info = graph.depth_info(ref.id)
+            matches = StaticMatches(block.px, block.inv_depth, info, pair.matches.new_px, weight, graph.lens.g)
+            sigma = self.parts.provider.depth_sigma_ratio
+            alignment = align(pair, matches, guess, self.config.correction, self.config.alignment, sigma)  # III-B
+        else:
+            alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
+        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size))
+
+    def believed(self, view: TwoView) -> bool:
+        """Enough static matches, and enough of them agree on the pose."""
+        enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
+        return bool(enough) and view.alignment.inlier_ratio >= self.config.tracking.min_inlier_ratio
+
+    def recognised(self, kf: Keyframe, work: WorkFrame, prior: Array) -> TwoView | None:
+        """``work`` seen from a keyframe that it may never have been near: features start the flow, then as ever."""
+        start = self.parts.features.flow(kf.work.gray, work.gray)
+        if start is None:
+            return None
+        view = self.compare(kf, work, prior, start, np.eye(4))
+        return view if self.believed(view) else None
+
+
+def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:
+    used = weight > 0.05
+    if used.sum() < 10:
+        return float("inf"), 0
+    moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
+    return float(np.quantile(moved, 0.75)) / float(np.sqrt(size[0] * size[1])), int(used.sum())

@@ -1,0 +1,96 @@
+"""Submaps: pieces of a trajectory with a world and a scale of their own, and how they become one again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.se3 import inverse, se3_exp, se3_log
+from ..types import Matches
+from .depth import trust
+from .keyframe_graph import KeyframeGraph
+
+Array = NDArray[Any]
+VELOCITY_FRAMES = 6  # over how many frames a velocity is taken
+MOST_AHEAD = 3.0  # for how many times that span it is believed
+MIN_COMMON = 20  # matches whose depth is known on both sides, for a scale
+
+
+def scale_between(
+    graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: Matches, weight: Array
+) -> float | None:
+    """Lengths of i's submap per length of j's: median ratio of matched depths; None where too few are known.
+
+    ``j_from_i`` (4, 4) in i's lengths; ``matches`` of i's pixels in j, ``weight`` (p,).
+    """
+    a, b, grid = graph.blocks[i], graph.blocks[j], graph.keyframes[j].work.grid
+    known_a = trust(a.inv_depth, graph.depth_info(i)) > 0.5
+    rays = graph.camera().rays(a.px)
+    depth = (rays / np.maximum(a.inv_depth, 1e-9)[:, None]) @ j_from_i[2, :3] + j_from_i[2, 3]
+    cell_px = min(graph.size[0] // grid[1], graph.size[1] // grid[0])
+    at = matches.new_px / cell_px - 0.5 + 0.5 / cell_px
+    xy = at.astype(np.float32)[:, None]
+    inv_b = cv2.remap(b.inv_depth.reshape(grid).astype(np.float32), xy, None, cv2.INTER_NEAREST)[:, 0]
+    trusted = trust(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
+    known_b = cv2.remap(trusted, xy, None, cv2.INTER_NEAREST)[:, 0] > 0.5
+    used = known_a & known_b & (weight > 0.05) & (depth > 0) & (inv_b > 0)
+    return float(np.median(depth[used] * inv_b[used])) if used.sum() >= MIN_COMMON else None
+
+
+def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, scale: float) -> None:
+    """Bring j's submap into the world of i's, by the pose of j against i and the scale; they are one from here on.
+
+    ``j_from_i`` (4, 4) in i's lengths; ``scale``: i's lengths per length of j's submap.
+    """
+    keep, gone = graph.submap_of[i], graph.submap_of[j]
+    cam_from_a = j_from_i @ graph.blocks[i].cam_from_world
+    cam_from_b = graph.blocks[j].cam_from_world
+    stretched = cam_from_b.copy()
+    stretched[:3, 3] *= scale
+    b_from_a = inverse(stretched) @ cam_from_a  # both in a's lengths
+    moved = graph.members(gone)
+    for r in graph.records:
+        if r.kf_id in moved:
+            r.cam_from_kf = r.cam_from_kf.copy()
+            r.cam_from_kf[:3, 3] *= scale
+    for k in moved:
+        block = graph.blocks[k]
+        pose = block.cam_from_world.copy()
+        pose[:3, 3] *= scale
+        block.cam_from_world = pose @ b_from_a
+        block.inv_depth, block.prior_depth = block.inv_depth / scale, block.prior_depth / scale
+        block.prior_info, block.depth_info = block.prior_info * scale**2, block.depth_info * scale**2
+        graph.submap_of[k] = keep
+    graph.started.discard(gone)
+    if graph.submap == gone:
+        graph.submap = keep
+
+
+def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
+    """Place submaps that were never recognised where the camera would have gone: (first, last) frame of each.
+
+    Constant velocity over the gap, and the same median depth on both sides of it. Such poses are guesses, so the
+    frames' state becomes "interpolated".
+    """
+    out = []
+    for submap in sorted(set(graph.submap_of.values()))[1:]:
+        ids = set(graph.members(submap))
+        own = [n for n, r in enumerate(graph.records) if r.kf_id in ids and r.state != "lost"]
+        before = [r for r in graph.records[: own[0]] if r.kf_id not in ids and r.state != "lost"]
+        for n in own:
+            graph.records[n].state = "interpolated"
+        out.append((graph.records[own[0]].index, graph.records[own[-1]].index))
+        if not before:
+            continue
+        first, last, past = graph.records[own[0]], before[-1], before[-min(len(before), VELOCITY_FRAMES)]
+        now, then = (r.cam_from_kf @ graph.blocks[r.kf_id].cam_from_world for r in (last, past))
+        span_s = max(last.timestamp_s - past.timestamp_s, 1e-9)
+        ahead = min((first.timestamp_s - last.timestamp_s) / span_s, MOST_AHEAD)
+        guess = se3_exp(ahead * se3_log(now @ inverse(then))) @ now
+        i, j = last.kf_id, first.kf_id
+        scale = graph.median_inv_depth(j) / graph.median_inv_depth(i)
+        join(graph, i, j, guess @ inverse(graph.blocks[i].cam_from_world), float(scale))
+    return out
