@@ -16,9 +16,11 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 from . import __version__
+from .cli_weights import weights_parser
 from .config import Config, config_from_dict, config_from_yaml, config_to_yaml, with_override
 from .errors import ConfigError
 
+INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, with OpenCV's distortion"
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
 
@@ -75,6 +77,7 @@ def _parser() -> argparse.ArgumentParser:
     view = commands.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path)
     view.set_defaults(act=_view)
+    weights_parser(commands.add_parser("weights", help="list, download and check the weights of the networks"))
     doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=_doctor)
     return parser
@@ -91,7 +94,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--correction", choices=("none", "coarse", "fine", "coarse-to-fine"))
     p.add_argument("--map-loss", choices=("plain", "mask", "uncertainty", "full"))
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
-    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1]", help="pixels of the full-size image")
+    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]", help=INTRINSICS_HELP)
     p.add_argument("--start", type=int, help="first frame, from 0")
     p.add_argument("--end", type=int, help="one past the last frame")
     p.add_argument("--stride", type=int, help="every n-th frame")
@@ -125,9 +128,9 @@ def _numbers(text: str) -> tuple[float, ...]:
     try:
         numbers = tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
-        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy[,k1], got {text!r}") from e
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got {text!r}") from e
     if not numbers:
-        raise ConfigError("--intrinsics: expected fx,fy,cx,cy[,k1], got nothing")
+        raise ConfigError("--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got nothing")
     return numbers
 
 
@@ -220,11 +223,13 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
 def _doctor(args: argparse.Namespace, console: Console) -> int:
     from .export.machine import machine_info
+    from .parts import chosen_pointmaps
 
     table = Table(show_header=False)
     for key, value in machine_info().items():
         table.add_row(key, str(value))
     Console().print(table)
-    Console().print("pointmaps auto: geometric (no weights needed) · splat backend: cpu (numba)")
+    kind, why = chosen_pointmaps(Config())
+    Console().print(f"pointmaps auto: {kind} ({why}) · splat backend: cpu (numba)")
     Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
     return 0

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .config import Config
+from .config import Config, NetworksConfig
 from .errors import ConfigError, InputError
 from .graph.places import PlaceIndex
+from .networks import weights
 from .pointmap.base import PointmapProvider
 from .pointmap.features import FeatureStart
 from .pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, working_size
-from .types import Source
+from .types import Frame, Source, WorkFrame
 
 Array = NDArray[Any]
 
@@ -28,41 +30,114 @@ class Parts:
     features: FeatureStart = field(default_factory=FeatureStart)
     places: PlaceIndex = field(default_factory=PlaceIndex)
     notes: list[str] = field(default_factory=list)
+    semantic: Callable[[Frame], Frame] | None = None  # fills Frame.semantic; None: what the source brings
+    own_scale_known: bool = True  # False: the depth of every frame alone has a scale of its own
 
     def __post_init__(self) -> None:
         width, height = self.size
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self.grid_px = np.stack([x, y], -1)
 
+    def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
+        """The frame with its semantic prior, as the provider sees it; ``near`` sees the same place."""
+        return self.provider.observe(frame if self.semantic is None else self.semantic(frame), near)
+
 
 def build_parts(config: Config, source: Source) -> Parts:
-    """Choose and build the parts. Raises ConfigError for a choice that this machine or source cannot serve."""
-    width, height = working_size(*source.size, config.tracking.area_px)
-    notes = []
-    kind = config.pointmaps
-    if kind == "auto":
-        kind = "geometric"
-        notes.append("pointmaps: geometric, chosen by auto (no MASt3R weights are installed)")
-    if kind == "mast3r":
-        raise ConfigError(
-            "--pointmaps mast3r: expected MASt3R weights, which this version cannot load yet; use geometric or depth"
-        )
+    """Choose and build the parts. Raises ConfigError and InputError for what this machine or source cannot serve."""
+    kind, why = chosen_pointmaps(config)
+    notes = [f"pointmaps: {kind}, chosen by auto ({why})"] if why else []
     if kind == "depth" and not source.has_depth:
         raise InputError(f"--pointmaps depth: expected a TUM-layout folder with depth.txt, {source.name} has no depth")
-    provider_class = SensorDepthPointmaps if kind == "depth" else GeometricPointmaps
-    provider = provider_class(width, height, config.tracking.cell_px)
-    notes.append(_semantics_note(config, source))
-    return Parts(provider, (width, height), notes=notes)
+    prior, why = chosen_semantics(config, source)
+    notes.append(f"semantics: {prior}" + (f", chosen by auto ({why})" if why else ""))
+    if kind == "mast3r":
+        parts = _mast3r(config, source)
+    else:
+        width, height = working_size(*source.size, config.tracking.area_px)
+        provider_class = SensorDepthPointmaps if kind == "depth" else GeometricPointmaps
+        parts = Parts(provider_class(width, height, config.tracking.cell_px), (width, height))
+    if prior == "dinov2":
+        parts.semantic, note = _dinov2(config.networks)
+        parts.notes.append(note)
+    parts.notes[:0] = notes
+    return parts
 
 
-def _semantics_note(config: Config, source: Source) -> str:
-    if config.semantics == "dinov2":
-        raise ConfigError(
-            "--semantics dinov2: expected DINOv2 weights, which this version cannot load yet; use maps or none"
-        )
+def chosen_pointmaps(config: Config) -> tuple[str, str]:
+    """The provider's name, and why ``auto`` chose it; no reason where the user did."""
+    if config.pointmaps != "auto":
+        return config.pointmaps, ""
+    lack = _lack(config.networks.mast3r, "MASt3R")
+    return ("geometric", lack) if lack else ("mast3r", "weights and an accelerator are there")
+
+
+def chosen_semantics(config: Config, source: Source) -> tuple[str, str]:
+    """The prior's name, and why ``auto`` chose it. Raises InputError where maps are asked for and there are none."""
     if config.semantics == "maps" and not source.has_semantic:
         raise InputError(f"--semantics maps: expected probability maps beside the frames, {source.name} has none")
-    if config.semantics == "auto":
-        chosen = "maps, chosen by auto (the source brings them)" if source.has_semantic else "none, chosen by auto"
-        return f"semantics: {chosen}"
-    return f"semantics: {config.semantics}"
+    if config.semantics != "auto":
+        return config.semantics, ""
+    if source.has_semantic:
+        return "maps", "the source brings them"
+    lack = _lack(config.networks.dinov2, "DINOv2")
+    return ("none", lack) if lack else ("dinov2", "weights and an accelerator are there")
+
+
+def _lack(what: str, title: str) -> str:
+    """What is missing for a network to be the default, or nothing. torch is loaded only where weights are there."""
+    if not weights.installed(what):
+        return f"no {title} weights are installed"
+    return "no accelerator" if _device() == "cpu" else ""
+
+
+def _device() -> str:
+    from .mapping.rasterise import torch_device
+
+    return torch_device()
+
+
+def _precision(config: NetworksConfig, device: str) -> str:
+    return config.precision if config.precision != "auto" else "float32" if device == "cpu" else "bfloat16"
+
+
+def _mast3r(config: Config, source: Source) -> Parts:
+    """The network provider. Raises InputError that names the command which brings the weights."""
+    c = config.networks
+    if c.long_side_px < 64 or c.long_side_px % 16:
+        raise ConfigError(f"networks.long_side_px: expected a multiple of 16 from 64 on, got {c.long_side_px}")
+    path = weights.path(c.mast3r)
+    from .networks.load import load_pair_network
+    from .networks.matching import match_pixels
+    from .pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
+    from .pointmap.matching import FoundPixels
+
+    device = _device()
+    precision = _precision(c, device)
+    network = load_pair_network(path, device, precision, c.long_side_px)
+    width, height = working_size_of(network, source.size)
+
+    def match_there(*arguments: Any) -> FoundPixels:
+        return FoundPixels(*match_pixels(*arguments))
+
+    provider = Mast3rPointmaps(
+        network, width, height, config.tracking.cell_px, matcher=match_on_host if device == "cpu" else match_there
+    )
+    note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, working image {width}x{height}"
+    return Parts(provider, (width, height), notes=[note], own_scale_known=False)
+
+
+def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:
+    """What gives a frame its P(foreground), with a memory over the video, and a line about it."""
+    path = weights.path(config.dinov2)
+    from .networks.dinov2 import Dinov2Features
+    from .networks.foreground import ForegroundPrior
+
+    device = _device()
+    precision = _precision(config, device)
+    features, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+
+    def fill(frame: Frame) -> Frame:
+        return replace(frame, semantic=prior(features.one(frame.image).features))
+
+    return fill, f"DINOv2: {config.dinov2}, {precision} on {device}"

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, config_to_yaml
-from .errors import ConfigError, InputError, SlamError
+from .errors import InputError, SlamError
 from .evaluation.evaluate import evaluate
 from .evaluation.image_error import psnr
 from .export.machine import peak_rss_mib
@@ -29,6 +29,7 @@ from .mapping.mapper import Mapper
 from .mapping.ply import write_gaussians_ply
 from .parts import build_parts
 from .progress import Reporter, Silent
+from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
 from .second_pass import SecondPass, second_pass
 from .slam import Slam
 from .sources import open_source
@@ -65,10 +66,11 @@ def run(
         want_semantic=want_semantic,
         semantic_dir=maps,
     )
-    config = _camera_checked(config)
-    parts = build_parts(config, source)  # refuses before anything is written
-    folder = RunFolder(out, command or [])
-    job = _Job(source, config, Slam(config, parts, source.size), folder, reporter or Silent())
+    rectifier = rectifier_for(config.camera.intrinsics, source.size)
+    tracked = _tracked(source, rectifier)
+    parts = build_parts(config, tracked)  # refuses before anything is written
+    slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
+    job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent())
     try:
         job.everything()
     except SlamError as e:
@@ -77,36 +79,44 @@ def run(
     except KeyboardInterrupt:
         job.save_the_rest("stopped by the user (Ctrl-C)")
         raise
-    return RunResult(folder.path, job.metrics)
+    return RunResult(job.folder.path, job.metrics)
 
 
-def _camera_checked(config: Config) -> Config:
-    given = config.camera.intrinsics
-    if given and len(given) not in (4, 5):
-        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy or fx,fy,cx,cy,k1 in pixels, got {len(given)} numbers")
-    if given and (not np.isfinite(given).all() or min(given[:2]) <= 0):
-        raise ConfigError(f"--intrinsics: expected finite numbers with fx, fy > 0, got {given}")
-    return config
+def _tracked(source: Source, rectifier: Rectifier | None) -> Source:
+    """What tracking is shown: photographs, or the pinhole images made of them."""
+    return source if rectifier is None else RectifiedSource(source, rectifier)
+
+
+def _config_of_slam(config: Config, rectifier: Rectifier | None) -> Config:
+    """What tracking is told: where photographs are rectified, its lens is the pinhole."""
+    if rectifier is None:
+        return config
+    c = rectifier.pinhole
+    return replace(config, camera=replace(config.camera, intrinsics=(c.fx_px, c.fy_px, c.cx_px, c.cy_px)))
 
 
 class _Job:
     """One run in progress."""
 
-    def __init__(self, source: Source, config: Config, slam: Slam, folder: RunFolder, reporter: Reporter) -> None:
-        self.source, self.config, self.slam, self.folder, self.reporter = (
-            source,
-            config,
-            slam,
-            folder,
-            reporter,
-        )
+    def __init__(
+        self,
+        source: Source,
+        rectifier: Rectifier | None,
+        config: Config,
+        slam: Slam,
+        folder: RunFolder,
+        reporter: Reporter,
+    ) -> None:
+        self.source, self.rectifier = source, rectifier  # frames of the source are photographs
+        self.tracked = _tracked(source, rectifier)
+        self.config, self.slam, self.folder, self.reporter = config, slam, folder, reporter
         self.metrics: dict[str, Any] = {}
         self.timings: dict[str, float] = {}
         self._started = time.perf_counter()
         self._final: list[FinalFrame] = []
         folder.write_config(config_to_yaml(config))
         folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
-        folder.note(*slam.parts.notes)
+        folder.note(*slam.parts.notes, *([rectifier.note] if rectifier is not None else []))
 
     def everything(self) -> None:
         """All stages in order."""
@@ -114,7 +124,7 @@ class _Job:
             frames = self._track()
         with self._timed("joint optimisation"):
             self._solve()
-        lens_view = LensView(self.full_camera(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px)
+        lens_view = LensView(self.lens(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px)
         with self._timed("masks"):
             seen = self._look_again(lens_view)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
@@ -129,7 +139,7 @@ class _Job:
     def _track(self) -> int:
         count = 0
         with self.reporter.stage("tracking", self.source.length, "frames") as bar:
-            for frame in self.source.frames():
+            for frame in self.tracked.frames():
                 self.slam.step(frame)
                 count += 1
                 bar.advance()
@@ -149,31 +159,42 @@ class _Job:
     def _write_trajectory(self) -> None:
         graph = self.slam.graph
         self.folder.write_trajectory(trajectory_of(self._final))
-        self.folder.write_camera(self.full_camera())
+        lens = self.lens()
+        camera = lens.radial if isinstance(lens, OpenCvLens) else lens
+        self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None)
         report = graph.last_report
         sigma = report.focal_sigma_ratio if report is not None else None
         lost = [f for f in self._final if f.state == "interpolated"]
+        facts: dict[str, Any] = {
+            "focal_px": self._focal_px(),
+            "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
+            "k1": camera.k1,
+            "found": "given" if self.config.camera.intrinsics else "from the video",
+        }
+        if isinstance(lens, OpenCvLens):
+            facts["distortion"] = list(lens.distortion)
         self.folder.update(
-            camera={
-                "focal_px": self.full_camera().fx_px,
-                "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
-                "k1": self.full_camera().k1,
-                "found": "given" if self.config.camera.intrinsics else "from the video",
-            },
+            camera=facts,
             graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
 
-    def full_camera(self) -> Camera:
-        """The lens over the full-size image."""
+    def lens(self) -> Camera | OpenCvLens:
+        """The lens over the photograph: the calibrated one where photographs are rectified."""
+        if self.rectifier is not None:
+            return self.rectifier.lens
         return self.slam.graph.camera().resized(*self.source.size)
+
+    def _focal_px(self) -> float:
+        lens = self.lens()
+        return lens.focal_px if isinstance(lens, OpenCvLens) else lens.fx_px
 
     def _look_again(self, lens_view: LensView) -> SecondPass:
         with self.reporter.stage("masks", len(self._final), "frames") as bar:
 
-            def on_mask(timestamp_s: float, mask: Any) -> None:
-                self.folder.write_mask(timestamp_s, mask.probability)
+            def on_mask(timestamp_s: float, moving: Array) -> None:
+                self.folder.write_mask(timestamp_s, moving)
                 bar.advance()
 
             return second_pass(
@@ -184,6 +205,7 @@ class _Job:
                 self.config,
                 lens_view,
                 on_mask,
+                self.rectifier,
             )
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
@@ -217,7 +239,7 @@ class _Job:
             **evaluation.metrics,
             **self.metrics,
             "keyframes": len(self.slam.graph.keyframes),
-            "focal_px": self.full_camera().fx_px,
+            "focal_px": self._focal_px(),
             "fps_tracking": frames / self.timings["tracking"],
             "fps_total": frames / elapsed,
             "peak_rss_mib": peak_rss_mib(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import cv2
@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from .config import HOLDOUT_EVERY, Config
 from .dynamics.belief import DynamicBelief
-from .dynamics.data import DynamicMask
+from .dynamics.data import DynamicsInput
 from .finish import FinalFrame, kept_matches
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .lens_view import LensView
 from .parts import Parts
+from .rectify import Rectifier
 from .types import Frame, View
 from .view_depth import dynamics_input, static_at
 
@@ -46,9 +47,14 @@ def second_pass(
     parts: Parts,
     config: Config,
     lens_view: LensView,
-    on_mask: Callable[[float, DynamicMask], None],
+    on_mask: Callable[[float, Array], None],
+    rectifier: Rectifier | None = None,
 ) -> SecondPass:
-    """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``."""
+    """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``.
+
+    ``frames`` are photographs, and ``lens_view`` is of their lens. Where that was calibrated, ``rectifier`` makes
+    them what tracking saw. ``on_mask`` is given P(moving), (h, w) float32 over the photograph at working scale.
+    """
     out = SecondPass()
     belief = DynamicBelief(config.dynamics, *parts.size)
     chosen = _view_positions(final, config)
@@ -58,22 +64,37 @@ def second_pass(
         place = by_index.get(frame.index)
         if place is None:
             break
-        work = parts.provider.observe(frame)
+        seen = frame if rectifier is None else rectifier.frame(frame)
+        work = parts.observe(seen, graph.keyframes[place.record.kf_id].work)
         belief.prior(work.gray, work.semantic)
         given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0)
-        mask = belief.update(given)
-        on_mask(frame.timestamp_s, mask)
+        mask = belief.update(given if parts.own_scale_known else _at_expected_scale(given))
+        moving = _over_photograph(mask.probability, rectifier)
+        on_mask(frame.timestamp_s, moving)
         if place.record.is_keyframe:
             waiting.append(place.record.kf_id)
         if is_holdout(position):
             out.holdout.append(place)
             continue
         for kf_id in waiting:  # a holdout keyframe takes its colours from the frame after it
-            out.colors[kf_id], out.moving[kf_id] = _seen_by(frame.image, mask.probability, graph, kf_id, place)
+            out.colors[kf_id], out.moving[kf_id] = _seen_by(seen.image, mask.probability, graph, kf_id, place)
         waiting.clear()
         if position in chosen:
-            out.views.append(_view(frame, place, mask.probability, graph, parts, lens_view))
+            uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
+            if uncertainty is not None:
+                uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, rectifier))
+            out.views.append(_view(frame, place, moving, uncertainty, lens_view))
     return out
+
+
+def _at_expected_scale(given: DynamicsInput) -> DynamicsInput:
+    """The frame's own depth, whose scale is its own, brought to that of the depth expected, by their median ratio."""
+    own = given.own_inv_depth
+    both = None if own is None else (own > 0) & (given.inv_depth > 0)
+    if own is None or both is None or not both.any():
+        return given
+    scale = np.float32(np.median(own[both] / given.inv_depth[both]))
+    return replace(given, own_inv_depth=own / scale)
 
 
 def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
@@ -101,13 +122,15 @@ def _seen_by(image: Array, moving: Array, graph: KeyframeGraph, kf_id: int, plac
     return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0)
 
 
-def _view(
-    frame: Frame, place: FinalFrame, moving: Array, graph: KeyframeGraph, parts: Parts, lens_view: LensView
-) -> View:
+def _over_photograph(values: Array, rectifier: Rectifier | None) -> Array:
+    """A map over the image that was tracked, as a map over the photograph."""
+    return values if rectifier is None else rectifier.as_photograph(values)
+
+
+def _view(frame: Frame, place: FinalFrame, moving: Array, uncertainty: Array | None, lens_view: LensView) -> View:
     image, inside = lens_view.pinhole_image(frame.image)
     p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
     static = np.clip(1 - lens_view.pinhole_map(p), 0.01, 1) * inside  # exactly 0 means: no data
-    uncertainty = _uncertainty(place, graph, parts.size, lens_view)
     return View(
         frame.timestamp_s,
         image,
@@ -119,22 +142,22 @@ def _view(
     )
 
 
-def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], lens_view: LensView) -> Array | None:
-    """u(p) of eq. (16) on a cell around each match whose residual is above tau_unc; None where there is none."""
+def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], tau_px: float) -> Array | None:
+    """(h, w) u(p) of eq. (16) on a cell around each match with a residual above tau_unc; None where there is none."""
     record, block = place.record, graph.blocks[place.record.kf_id]
     if len(record.points) == 0:
         return None
     matches = kept_matches(graph, record)
     new_from_ref = inverse(place.world_from_cam) @ inverse(block.cam_from_world)
     error = np.minimum(matches.residual_px(new_from_ref), 50.0) ** 2
-    u = uncertainty_weight(error, lens_view.tau_px)
+    u = uncertainty_weight(error, tau_px)
     if not (u > 0).any():
         return None
     dense = np.zeros((size[1], size[0]), np.float32)
     for (x, y), value in zip(np.round(record.target[u > 0]).astype(int), u[u > 0], strict=True):
         cell = dense[max(0, y - 4) : y + 5, max(0, x - 4) : x + 5]
         np.maximum(cell, np.float32(value), out=cell)
-    return lens_view.pinhole_map(dense)
+    return dense
 
 
 def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:

@@ -8,6 +8,11 @@ from ..errors import InputError
 from .screen import ScreenStats
 
 
+def torch_device() -> str:
+    """ "cuda" where torch has an accelerator, "cpu" otherwise: what the networks run on."""
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
 def rasterization(
     means: torch.Tensor,
     quats: torch.Tensor,

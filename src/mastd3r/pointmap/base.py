@@ -13,8 +13,11 @@ class PointmapProvider(Protocol):
     name: str
     depth_sigma_ratio: float | None  # relative 1-sigma of the depth measured in one frame; None: measures none
 
-    def observe(self, frame: Frame) -> WorkFrame:
-        """What can be said of a frame alone: working image, pixels to match, own depth."""
+    def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
+        """What can be said of a frame alone: working image, pixels to match, own depth.
+
+        ``near``: a frame that sees the same place, for a network that looks at pairs only.
+        """
         ...
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:

@@ -31,8 +31,8 @@ class GeometricPointmaps:
         self.width, self.height, self.cell_px = width, height, cell_px
         self.flow = FlowMatcher(width, height)
 
-    def observe(self, frame: Frame) -> WorkFrame:
-        """Shrink to working size and choose the pixels that will be matched."""
+    def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
+        """Shrink to working size and choose the pixels that will be matched; ``near`` is not needed."""
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         gray = cv2.resize(gray, (self.width, self.height), interpolation=cv2.INTER_AREA)
         px, strength = corner_grid(gray, self.cell_px)

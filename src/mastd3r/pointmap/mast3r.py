@@ -1,0 +1,372 @@
+"""Pointmaps of a two-view network (MASt3R): points, matches and own depth from its decoded pairs (III-A, eq. (7)).
+
+Pixels. The whole photograph is shrunk to the network's scale (long side 512): that is the working image. The network
+sees a window of it whose sides are multiples of 16, at a whole-pixel offset, so network px = working px - offset and
+every camera is that of the working image. Outside the window nothing is measured: weight 0, own depth 0.
+
+Pairs. ``predict(ref, new)`` decodes new as FIRST view, as MASt3R-SLAM does in tracking: new's points and ref's points
+in new's camera, from which ref's pixels are found in new. One decode a pair; the other order is ``predict(new, ref)``.
+
+Own depth. A frame's depth is the z of its first decode as first view: with itself, or with the frame named ``near``
+in ``observe``, whose pair is then ready for ``predict`` and costs nothing more. Points of ref and of new are always
+this depth along the given camera's rays, so ``own_inv_depth`` and both pointmaps are of one mould and ICP, scale and
+re-mapping see one lens. Every frame has its own scale: that is what eq. (9) finds.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, fields, replace
+from typing import Any, Generic, Protocol, TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..geometry.camera import Camera
+from ..geometry.sim3 import Sim3, procrustes
+from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
+from .geometric import GeometricPointmaps
+from .matching import FoundPixels, MatchOptions, ViewMaps, match_pixels, subsampled
+
+Array = NDArray[Any]
+T = TypeVar("T")
+FLOW_STEP_PX = 8  # the dense flow is matched at one pixel of 8 x 8, and interpolated
+MIN_CONFIDENCE = 1.5  # of a point, in the network's own 1 … inf, for it to count as own depth
+EDGE_RATIO = 1.05  # inverse depths of neighbours that differ by more belong to two surfaces
+HALF_WEIGHT = 1.5  # descriptor confidence at which a match weighs one half
+MAX_INV_DEPTH = 1e4  # nearer than 0.1 mm is not a measurement
+MIN_INV_DEPTH = 1e-4  # farther than 10 km neither
+
+
+class Window(Protocol):
+    """Where the network's image lies in the photograph at the network's scale."""
+
+    @property
+    def resized_size(self) -> tuple[int, int]: ...  # (width, height) of the whole photograph at that scale
+    @property
+    def crop_left_px(self) -> int: ...
+    @property
+    def crop_top_px(self) -> int: ...
+    @property
+    def net_size(self) -> tuple[int, int]: ...  # (width, height) of what the network sees
+
+
+class TwoViewNetwork(Protocol):
+    """The network behind the provider. ``networks.pair.PairNetwork`` is one."""
+
+    def prepare(self, image: Array) -> Any: ...  # (H, W, 3) uint8 RGB -> has .mapping, a Window
+    def encode(self, prepared: Any) -> Any: ...  # -> has .pooled, (c,) numpy: the mean token
+    def pair(self, a: Any, b: Any) -> Any: ...  # two encoded -> has .first, .second: ViewMaps, arrays or tensors
+
+
+Matcher = Callable[[ViewMaps, ViewMaps, Array, "Array | None", MatchOptions], FoundPixels]
+
+
+def working_size_of(network: TwoViewNetwork, full_size: tuple[int, int]) -> tuple[int, int]:
+    """(width, height) of the working image of photographs of ``full_size``. Raises InputError for a thin strip."""
+    width, height = network.prepare(np.zeros((full_size[1], full_size[0], 3), np.uint8)).mapping.resized_size
+    return width, height
+
+
+def match_on_host(
+    target: ViewMaps, source: ViewMaps, px: Array, start_px: Array | None, options: MatchOptions
+) -> FoundPixels:
+    """``match_pixels`` for maps that may lie on a device."""
+    return match_pixels(_HostMaps(target), _HostMaps(source), px, start_px, options)
+
+
+class _HostMaps:
+    """Maps as numpy, each brought over when it is asked for."""
+
+    def __init__(self, maps: ViewMaps) -> None:
+        self._maps = maps
+
+    @property
+    def points(self) -> Array:
+        return _array(self._maps.points)
+
+    @property
+    def descriptors(self) -> Array:
+        return _array(self._maps.descriptors)
+
+    @property
+    def descriptor_confidence(self) -> Array:
+        return _array(self._maps.descriptor_confidence)
+
+
+def _array(values: Any) -> Array:
+    """A tensor of any device as numpy; an array as it is."""
+    return np.asarray(values.cpu() if hasattr(values, "cpu") else values)
+
+
+@dataclass(frozen=True)
+class NetworkFrame(WorkFrame):
+    """A working frame that the network can be shown."""
+
+    prepared: Any  # the network's image, to encode it again should its tokens be forgotten
+    window: Window
+    serial: int  # one a call of observe
+    focal_px: float | None  # the lens that its points speak of, at working size; None: they speak of none
+
+
+class Mast3rPointmaps:
+    """Provider over an injected network. Not safe for use from several threads: it remembers tokens and pairs."""
+
+    name = "mast3r"
+    # Chosen, not measured: errors of such depths are of this order after their scale is found, and are smooth.
+    depth_sigma_ratio: float | None = 0.08
+
+    def __init__(
+        self,
+        network: TwoViewNetwork,
+        width: int,
+        height: int,
+        cell_px: int,
+        *,
+        options: MatchOptions | None = None,
+        matcher: Matcher = match_on_host,
+        remembered_frames: int = 48,
+        remembered_pairs: int = 4,
+    ) -> None:
+        """``width`` and ``height`` are those of ``working_size_of``; maps on a device want a matcher for them."""
+        self.network, self.width, self.height, self.cell_px = network, width, height, cell_px
+        self.options, self.matcher = options or MatchOptions(), matcher
+        self._look = GeometricPointmaps(width, height, cell_px)
+        self._encoded: _Remembered[Any] = _Remembered(remembered_frames)
+        self._pairs: _Remembered[Any] = _Remembered(remembered_pairs)
+        self._serial = itertools.count()
+
+    def observe(self, frame: Frame, near: WorkFrame | None = None) -> NetworkFrame:
+        """Working image, pixels to match, own depth.
+
+        ``near``: a frame that sees the same place (the keyframe that the next ``predict`` will name as ref); the own
+        depth then comes from the pair with it. Without it the frame is paired with itself: one more decode.
+        Raises InputError where the frame's size does not give the provider's working size.
+        """
+        prepared = self.network.prepare(frame.image)
+        window: Window = prepared.mapping
+        if tuple(window.resized_size) != (self.width, self.height):
+            h, w = frame.image.shape[:2]
+            raise InputError(
+                f"frame {frame.index}: expected frames whose working size is {self.width}x{self.height}, "
+                f"got {w}x{h} pixels, which give {window.resized_size[0]}x{window.resized_size[1]}"
+            )
+        seen = _fields(self._look.observe(frame))
+        new = NetworkFrame(**seen, prepared=prepared, window=window, serial=next(self._serial), focal_px=None)
+        first = self._decoded(new, new if near is None else _network_frame(near)).first
+        points, confidence = _array(first.points), _array(first.confidence)
+        own = np.zeros((self.height, self.width), np.float32)
+        in_window(own, window)[:] = own_inv_depth(points, confidence)
+        centre = (self.width - 1) / 2 - window.crop_left_px, (self.height - 1) / 2 - window.crop_top_px
+        focal = focal_from_points(points, in_window(own, window) > 0, centre)
+        return replace(new, own_inv_depth=own, focal_px=focal)
+
+    def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
+        """Ref's chosen pixels found in new, and both pointmaps in ref's camera, in the scale of guess.ref_inv_depth.
+
+        ``guess.flow`` is where the search starts. ``new_own`` keeps new's own scale.
+        """
+        a, b = _network_frame(ref), _network_frame(new)
+        pair = self._decoded(b, a)
+        matches, flow = self._matches(a, b, pair, guess.flow)
+        factor = _scale_to(guess, sample_smooth(a.own_inv_depth, a.px))
+        ref_map = _along_rays(a, a.px, guess.camera, _at(pair.second.confidence, a.window, a.px), factor)
+        confidence = _at(pair.first.confidence, b.window, matches.new_px) * (matches.weight > 0)
+        own = _along_rays(b, matches.new_px, guess.camera, confidence, 1.0)
+        new_map = _moved(own, ref_map, matches.weight)
+        return PairPrediction(matches, ref_map, new_map, own, flow)
+
+    def place_descriptor(self, work: WorkFrame) -> Array:
+        """(c,) float32 of unit length, alike where two frames show the same place: the mean token. 0 if not finite."""
+        pooled = np.asarray(self._tokens(_network_frame(work)).pooled, np.float32).reshape(-1)
+        length = float(np.linalg.norm(pooled))
+        return pooled / length if np.isfinite(length) and length > 0 else np.zeros_like(pooled)
+
+    # -- the network, each thing once ------------------------------------------------------------------------
+
+    def _tokens(self, frame: NetworkFrame) -> Any:
+        return self._encoded.get(frame.serial, lambda: self.network.encode(frame.prepared))
+
+    def _decoded(self, first: NetworkFrame, second: NetworkFrame) -> Any:
+        def decode() -> Any:
+            return self.network.pair(self._tokens(first), self._tokens(second))
+
+        return self._pairs.get((first.serial, second.serial), decode)
+
+    def _matches(self, ref: NetworkFrame, new: NetworkFrame, pair: Any, start: Array | None) -> tuple[Matches, Array]:
+        """Matches of ref's chosen pixels, and the dense flow ref -> new (h, w, 2) float32."""
+        offset, (w, h) = _corner(ref.window), ref.window.net_size
+        chosen = np.round(ref.px) - offset
+        inside = ((chosen >= 0) & (chosen < [w, h])).all(1)
+        cells, grid = subsampled(h, w, FLOW_STEP_PX)
+        at = np.concatenate([chosen[inside], cells])
+        begin = at if start is None else at + _flow_at(start, at + offset)
+        shift = offset - _corner(new.window)  # 0 for frames of one size
+        found = self.matcher(pair.first, pair.second, at, begin + shift, self.options)
+        moved, n = found.px - shift - at, int(inside.sum())
+        flow = self._spread(moved[n:], found.valid[n:], grid, offset, start)
+        new_px = ref.px + _flow_at(flow, ref.px)
+        new_px[inside] = np.where(found.valid[:n, None], ref.px[inside] + moved[:n], new_px[inside])
+        weight = np.zeros(len(ref.px))
+        weight[inside] = np.where(found.valid[:n], found.confidence[:n] / (found.confidence[:n] + HALF_WEIGHT), 0.0)
+        return Matches(ref.px, new_px, weight), flow
+
+    def _spread(
+        self, moved: Array, valid: Array, grid: tuple[int, int], offset: Array, fallback: Array | None
+    ) -> Array:
+        """(h, w, 2) float32 flow over the working image from the cells' motion; unmatched cells take their
+        neighbours', all of them the start's (or none) where nothing matched."""
+        if not valid.any():
+            return np.zeros((self.height, self.width, 2), np.float32) if fallback is None else fallback
+        cells = _smoothly_filled(moved.reshape(*grid, 2), valid.reshape(grid))
+        x = (np.arange(self.width) - offset[0] - FLOW_STEP_PX // 2) / FLOW_STEP_PX
+        y = (np.arange(self.height) - offset[1] - FLOW_STEP_PX // 2) / FLOW_STEP_PX
+        map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
+        return cv2.remap(cells, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+class _Remembered(Generic[T]):
+    """The values of the last few keys."""
+
+    def __init__(self, most: int) -> None:
+        self.most, self._values = most, OrderedDict[Hashable, T]()
+
+    def get(self, key: Hashable, make: Callable[[], T]) -> T:
+        if key not in self._values:
+            self._values[key] = make()
+        self._values.move_to_end(key)
+        while len(self._values) > self.most:
+            self._values.popitem(last=False)
+        return self._values[key]
+
+
+def _fields(frame: WorkFrame) -> dict[str, Any]:
+    return {f.name: getattr(frame, f.name) for f in fields(WorkFrame)}
+
+
+def _network_frame(frame: WorkFrame) -> NetworkFrame:
+    if not isinstance(frame, NetworkFrame):
+        raise TypeError(f"Mast3rPointmaps: expected a frame of its own observe(), got {type(frame).__name__}")
+    return frame
+
+
+def own_inv_depth(points: Array, confidence: Array) -> Array:
+    """(h, w) float32 1/z of a view's points in its own camera; 0 where they are unsure or nonsense."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inv_depth = 1 / points[..., 2]
+    known = (inv_depth > MIN_INV_DEPTH) & (inv_depth < MAX_INV_DEPTH) & (confidence > MIN_CONFIDENCE)
+    known &= np.isfinite(points).all(-1)
+    return np.where(known, inv_depth, 0).astype(np.float32)
+
+
+def in_window(values: Array, window: Window) -> Array:
+    """The part of a working-size map (h, w, …) that the network sees; a view, not a copy."""
+    x, y, (w, h) = window.crop_left_px, window.crop_top_px, window.net_size
+    return values[y : y + h, x : x + w]
+
+
+def _corner(window: Window) -> Array:
+    return np.array([window.crop_left_px, window.crop_top_px], float)
+
+
+def focal_from_points(points: Array, known: Array, centre_px: tuple[float, float]) -> float | None:
+    """Focal length in px of a pointmap in its own camera (h, w, 3): median of u·q/|q|², u = px - centre, q = xy/z.
+
+    One pixel of 4 x 4 speaks, if off the centre by a tenth of the diagonal; None for fewer than 50 of them.
+    """
+    y, x = np.argwhere(known[::4, ::4]).T * 4
+    u = np.stack([x - centre_px[0], y - centre_px[1]], 1)
+    far = np.hypot(*u.T) > 0.1 * np.hypot(*known.shape)
+    at = points[y[far], x[far]].astype(float)
+    q, u = at[:, :2] / at[:, 2:], u[far]
+    along = (u * q).sum(1)
+    fine = along > 0
+    if fine.sum() < 50:
+        return None
+    return float(np.median(along[fine] / (q[fine] ** 2).sum(1)))
+
+
+def sample_smooth(inv_depth: Array | None, px: Array) -> Array:
+    """(p,) bilinear inverse depth; 0 where a corner is unknown or outside, or the corners are two surfaces.
+
+    Inverse depth, because that of a plane is linear in the pixel.
+    """
+    if inv_depth is None:
+        return np.zeros(len(px))
+    h, w = inv_depth.shape
+    inside = (px[:, 0] >= 0) & (px[:, 1] >= 0) & (px[:, 0] <= w - 1) & (px[:, 1] <= h - 1)
+    at = np.where(inside[:, None], px, 0.0)
+    x, y = np.minimum(at.astype(int), [max(w - 2, 0), max(h - 2, 0)]).T
+    a, b = at[:, 0] - x, at[:, 1] - y
+    corners = np.stack([inv_depth[y + j, x + i] for j in (0, 1) for i in (0, 1)]).astype(float)
+    share = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
+    counts = share > 1e-9
+    low = np.where(counts, corners, np.inf).min(0)
+    high = np.where(counts, corners, 0.0).max(0)
+    return np.where(inside & (low > 0) & (high < EDGE_RATIO * low), (share * corners).sum(0), 0.0)
+
+
+def _at(confidence: Any, window: Window, px: Array) -> Array:
+    """(p,) 0..1 from the network's confidence 1 … inf at working pixels: 1 - 1/c; 0 outside and where not finite."""
+    x, y = (np.round(px) - _corner(window)).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < window.net_size[0]) & (y < window.net_size[1])
+    raw = _array(confidence)[np.where(inside, y, 0), np.where(inside, x, 0)].astype(float)
+    return np.where(inside & np.isfinite(raw) & (raw > 1), 1 - 1 / np.maximum(raw, 1), 0.0)
+
+
+def _along_rays(frame: NetworkFrame, px: Array, camera: Camera, confidence: Array, factor: float) -> Pointmap:
+    """Own depth times ``factor`` along the camera's rays; confidence 0, and depth 1, where there is none."""
+    inv_depth = sample_smooth(frame.own_inv_depth, px)
+    known = inv_depth > 0
+    points = camera.rays(px) * (factor / np.where(known, inv_depth, factor))[:, None]
+    return Pointmap(px, points, np.where(known, confidence, 0.0))
+
+
+def _scale_to(guess: Guess, own_inv_depth: Array) -> float:
+    """What brings ref's own lengths to those of the guess: median ratio over depths known to 15 %; 1 if there are
+    fewer than 20."""
+    if guess.ref_inv_depth is None or guess.ref_depth_info is None:
+        return 1.0
+    sure = guess.ref_depth_info * guess.ref_inv_depth**2 > 1 / 0.15**2
+    sure &= (own_inv_depth > 0) & (guess.ref_inv_depth > 0)
+    return float(np.median(own_inv_depth[sure] / guess.ref_inv_depth[sure])) if sure.sum() >= 20 else 1.0
+
+
+def _moved(own: Pointmap, ref: Pointmap, weight: Array) -> Pointmap:
+    """New's own points in ref's camera, by the closed form over the matches, the worst of them fading out."""
+    w = weight * (own.confidence > 0) * (ref.confidence > 0)
+    if (w > 0).sum() < 6:
+        return Pointmap(own.px, own.points, np.zeros(len(own.px)))
+    for _ in range(4):
+        ref_from_new: Sim3 = procrustes(ref.points, own.points, w, with_scale=True)
+        moved = ref_from_new.apply(own.points)
+        away = np.linalg.norm(moved - ref.points, axis=1) / np.maximum(ref.points[:, 2], 1e-9)
+        usual = max(2 * float(np.median(away[w > 0])), 1e-6)
+        w = weight * (own.confidence > 0) * (ref.confidence > 0) / (1 + (away / usual) ** 2)
+    return Pointmap(own.px, moved, own.confidence)
+
+
+def _flow_at(flow: Array, px: Array) -> Array:
+    """(p, 2) bilinear flow at working pixels; the nearest pixel's outside."""
+    h, w = flow.shape[:2]
+    at = np.clip(px, 0, [w - 1, h - 1])
+    x, y = np.minimum(at.astype(int), [w - 2, h - 2]).T
+    a, b = (at[:, 0] - x)[:, None], (at[:, 1] - y)[:, None]
+    upper, lower = flow[y, x] * (1 - a) + flow[y, x + 1] * a, flow[y + 1, x] * (1 - a) + flow[y + 1, x + 1] * a
+    return np.asarray(upper * (1 - b) + lower * b, float)
+
+
+def _smoothly_filled(values: Array, valid: Array) -> Array:
+    """(rows, cols, 2) float32: valid cells as they are, the others from valid neighbours, near ones first."""
+    weight = valid.astype(np.float32)
+    known = np.where(valid[..., None], values, 0).astype(np.float32)
+    out = np.broadcast_to(np.median(values[valid], axis=0), values.shape).astype(np.float32)
+    for sigma in (8.0, 4.0, 2.0, 1.0):
+        near = cv2.GaussianBlur(weight, (0, 0), sigma)[..., None]
+        share = np.minimum(near / 0.15, 1.0)
+        out = share * cv2.GaussianBlur(known, (0, 0), sigma) / np.maximum(near, 1e-9) + (1 - share) * out
+    return np.where(valid[..., None], known, out)
