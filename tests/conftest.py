@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,14 @@ from mastd3r.sources import synthetic
 from mastd3r.types import Matches, WorkFrame
 
 Array = NDArray[Any]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What ``auto`` chooses must not depend on what this machine's user has downloaded."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("MASTD3R_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -40,7 +48,7 @@ def room_views() -> list[synthetic.SyntheticView]:
 
 @dataclass(frozen=True)
 class ExactScene:
-    """A wavy wall seen by cameras on an arc, under the solver's own lens: u = x_d (1 + k |x_d|²).
+    """A wavy wall seen by cameras on an arc, under the solver's own lens: u = x_d (1 + k |x_d|² + m |x_d|⁴ + n |x_d|⁶).
 
     Written out here from the definition, so that nothing under test makes its own truth.
     """
@@ -52,16 +60,27 @@ class ExactScene:
     cam_from_world: tuple[Array, ...]
     px: Array  # (p, 2) the grid of every view
     grid: tuple[int, int]
+    higher: tuple[float, float] = (0.0, 0.0)  # m, n
+    off_centre_px: tuple[float, float] = (0.0, 0.0)  # of the principal point from the image's centre
+
+    @property
+    def centre_px(self) -> Array:
+        """(2,) principal point."""
+        return np.array([(self.width - 1) / 2, (self.height - 1) / 2]) + self.off_centre_px
 
     @property
     def lens(self) -> Array:
-        """(4,) log f, k, cx, cy."""
-        return np.array([np.log(self.focal_px), self.k, (self.width - 1) / 2, (self.height - 1) / 2])
+        """(6,) log f, k, cx, cy, m, n."""
+        return np.array([np.log(self.focal_px), self.k, *self.centre_px, *self.higher])
+
+    def _bend(self, x: Array) -> Array:
+        r2 = (x**2).sum(1, keepdims=True)
+        return 1 + self.k * r2 + self.higher[0] * r2**2 + self.higher[1] * r2**3
 
     def rays(self, px: Array) -> Array:
         """(p, 2) distorted pixels to (p, 3) rays with z = 1."""
-        x = (px - self.lens[2:]) / self.focal_px
-        x = x * (1 + self.k * (x**2).sum(1, keepdims=True))
+        x = (px - self.centre_px) / self.focal_px
+        x = x * self._bend(x)
         return np.concatenate([x, np.ones((len(x), 1))], 1)
 
     def pixels(self, points_cam: Array) -> Array:
@@ -69,8 +88,8 @@ class ExactScene:
         u = points_cam[:, :2] / points_cam[:, 2:]
         x = u
         for _ in range(60):
-            x = u / (1 + self.k * (x**2).sum(1, keepdims=True))
-        return x * self.focal_px + self.lens[2:]
+            x = u / self._bend(x)
+        return x * self.focal_px + self.centre_px
 
     def depth(self, i: int, px: Array | None = None) -> Array:
         """(p,) exact depth of view i's pixels: each ray cut with z = wall(x, y)."""
@@ -126,12 +145,21 @@ def _arc(n: int, step: float) -> tuple[Array, ...]:
 def exact_scene() -> Callable[..., ExactScene]:
     """``exact_scene(n_views, step=…, focal_px=…, k=…)``."""
 
-    def make(views: int, step: float = 0.15, focal_px: float = 260.0, k: float = 0.0, cell_px: int = 16) -> ExactScene:
+    def make(
+        views: int,
+        step: float = 0.15,
+        focal_px: float = 260.0,
+        k: float = 0.0,
+        cell_px: int = 16,
+        higher: tuple[float, float] = (0.0, 0.0),
+        off_centre_px: tuple[float, float] = (0.0, 0.0),
+    ) -> ExactScene:
         width, height = 320, 240
         rows, cols = height // cell_px, width // cell_px
         cy, cx = np.divmod(np.arange(rows * cols), cols)
         jitter = np.random.default_rng(0).uniform(0.2, 0.8, (rows * cols, 2))
         px = (np.stack([cx, cy], 1) + jitter) * cell_px
-        return ExactScene(width, height, focal_px, k, _arc(views, step), px, (rows, cols))
+        arc = _arc(views, step)
+        return ExactScene(width, height, focal_px, k, arc, px, (rows, cols), higher, off_centre_px)
 
     return make

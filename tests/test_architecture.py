@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import ast
 import importlib
 import re
@@ -34,17 +35,21 @@ LAYERS: dict[str, set[str]] = {
     "types": {"geometry", "errors"},
     "config": {"errors"},
     **{stage: {"geometry", *CONTRACTS} for stage in STAGES},
+    "networks": {"geometry", *CONTRACTS},
     "progress": set(),
-    "lens_view": {"geometry"},
+    "rectify": {"geometry", "types", "errors"},
+    "lens_view": {"geometry", "rectify"},
     "view_depth": {"geometry", "types", *STAGES},
-    "parts": {*CONTRACTS, *STAGES},
+    "parts": {*CONTRACTS, *STAGES, "networks"},
+    "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
-    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
-    "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish"},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
+    "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "run": {
-        "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress",
+        "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
     },
-    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run"},
+    "cli_weights": {"errors", "networks", "progress"},
+    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights"},
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
     "": set(),
@@ -57,11 +62,13 @@ EXCEPTIONS = {
 }
 
 HEAVY = {  # package: who may import it
-    "torch": {"mapping"},
+    "torch": {"mapping", "networks"},
+    "transformers": {"networks"},
+    "safetensors": {"networks"},
     "gsplat": {"mapping"},
     "av": {"sources"},
-    "numba": {"geometry", "dynamics", "mapping"},
-    "rich": {"progress", "cli_commands"},
+    "numba": {"geometry", "dynamics", "mapping", "pointmap"},
+    "rich": {"progress", "cli_commands", "cli_weights"},
 }
 NAMES_A_DEVICE = {"mapping.rasterise"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
@@ -139,8 +146,9 @@ def test_imports_keep_the_layers() -> None:
 
 
 def test_stages_do_not_see_one_another() -> None:
-    for stage in STAGES:
-        assert not LAYERS[stage] & (STAGES - {stage})
+    for stage in STAGES | {"networks"}:
+        assert not LAYERS[stage] & ((STAGES | {"networks"}) - {stage})
+    assert {name for name, seen in LAYERS.items() if "networks" in seen} == {"parts", "cli_weights"}
     assert all(importer == "config" for importer, imported in EXCEPTIONS if owner(imported) in STAGES)
 
 
@@ -253,16 +261,23 @@ def test_links_of_documents_lead_somewhere(path: Path) -> None:
 
 
 def test_options_in_the_readme_exist() -> None:
-    parser, known = _parser(), set()
-    for command in next(a.choices for a in parser._actions if isinstance(a.choices, dict)).values():
-        known |= {word for action in command._actions for word in action.option_strings}
+    known = set(_options(_parser()))
     named = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", (ROOT / "README.md").read_text(encoding="utf-8")))
     assert named and sorted(named - known) == []
 
 
+def _options(parser: argparse.ArgumentParser) -> Iterator[str]:
+    """Option words of a parser and of all its commands."""
+    for action in parser._actions:
+        yield from action.option_strings
+        if isinstance(action.choices, dict):
+            for command in action.choices.values():
+                yield from _options(command)
+
+
 def test_settings_in_the_documents_exist() -> None:
     text = "\n".join(p.read_text(encoding="utf-8") for p in DOCUMENTS)
-    settings = set(re.findall(r"\b((?:source|camera|tracking|graph|dynamics|mapping)\.\w+=\w+)", text))
+    settings = set(re.findall(r"\b((?:source|camera|tracking|graph|dynamics|mapping|networks)\.\w+=\w+)", text))
     assert settings
     for setting in settings:
         with_override(Config(), setting)

@@ -121,8 +121,8 @@ def test_a_file_that_is_no_video(mastd3r: Command, tmp_path: Path) -> None:
         (["--start", "-3"], ["start", "expected 0 or more", "got -3"]),
         (["--start", "4", "--end", "4"], ["end", "expected more than start", "got 4"]),
         (["--start", "400"], ["expected a start before its 24 frames end", "400"]),
-        (["--pointmaps", "mast3r"], ["mast3r", "expected MASt3R weights"]),
-        (["--semantics", "dinov2"], ["dinov2", "expected DINOv2 weights"]),
+        (["--pointmaps", "mast3r"], ["expected its weights", "mastd3r weights download mast3r"]),
+        (["--semantics", "dinov2"], ["expected its weights", "mastd3r weights download dinov2"]),
         (["--semantics", "maps"], ["--semantics maps", "expected probability maps"]),
     ],
 )

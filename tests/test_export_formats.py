@@ -99,6 +99,46 @@ def test_two_focal_lengths_are_not_joined() -> None:
     assert text.splitlines()[1] == "1 OPENCV 640 480 519.25 530 311 243.25 0.05 0 0 0"
 
 
+@pytest.mark.parametrize(
+    ("terms", "fy_px", "model"),
+    [
+        ((0.05, 0.0, 0.0), 519.25, "SIMPLE_RADIAL"),
+        ((0.0, 0.0, 0.0), 519.25, "SIMPLE_RADIAL"),
+        ((0.05, -0.02, 0.0), 519.25, "RADIAL"),
+        ((0.05, -0.02, 0.0), 530.0, "OPENCV"),
+        ((0.05, -0.02, 0.01), 519.25, "FULL_OPENCV"),
+        ((0.0, 0.0, 0.01), 530.0, "FULL_OPENCV"),
+    ],
+)
+def test_the_model_is_the_simplest_that_holds_the_lens(
+    terms: tuple[float, float, float], fy_px: float, model: str
+) -> None:
+    """Read back by the model's own documentation, every point is where our camera has it."""
+    camera = Camera(519.25, fy_px, 310.5, 242.75, 640, 480, *terms)
+    words = cameras_text(camera).splitlines()[1].split()
+    assert words[:4] == ["1", model, "640", "480"]
+    points = np.random.default_rng(0).uniform([-2, -2, 4], [2, 2, 6], (50, 3))
+    theirs = colmap_projection(model, np.array(words[4:], float), points)
+    np.testing.assert_allclose(theirs, camera.project(points) + 0.5, atol=1e-6)
+
+
+def colmap_projection(model: str, params: NDArray[np.float64], points_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The radial part of COLMAP's models, written from its documentation; tangential terms must be zero."""
+    if model == "SIMPLE_RADIAL":
+        return colmap_simple_radial(params, points_cam)
+    xy = points_cam[:, :2] / points_cam[:, 2:]
+    r2 = (xy**2).sum(1, keepdims=True)
+    if model == "RADIAL":
+        f, cx, cy, k1, k2 = params
+        fx, fy, bend = f, f, 1 + k1 * r2 + k2 * r2**2
+    else:
+        fx, fy, cx, cy, k1, k2, p1, p2 = params[:8]
+        assert p1 == p2 == 0
+        k3, k4, k5, k6 = params[8:] if model == "FULL_OPENCV" else np.zeros(4)
+        bend = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    return np.asarray(xy * bend * [fx, fy] + [cx, cy])
+
+
 def test_kitti_rows_are_the_poses(tmp_path: Path) -> None:
     trajectory = run_folder(tmp_path / "run")
     out = export_run(tmp_path / "run", "kitti", tmp_path / "poses.txt")

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from mastd3r.geometry.gauss_newton import damped_solve
 from mastd3r.geometry.reprojection import (
     MIN_DEPTH,
+    N_COLS,
     edge_residuals,
+    fold_radius,
     host_cost,
     host_system,
     pose_system,
@@ -23,35 +25,38 @@ from mastd3r.geometry.se3 import se3_exp
 Array = NDArray[Any]
 QUICK = settings(max_examples=25, deadline=None)
 WIDE_PX = 1e7  # a kernel so wide that it is none
+DEPTH = N_COLS  # index of the depth's column, behind pose and lens
+STEP = np.array([1e-6] * 6 + [1e-6, 1e-5, 1e-3, 1e-3, 1e-4, 3e-4] + [1e-6])  # of each unknown, for differences
 seeds = st.integers(0, 10**6)
 
 
 class Edges:
-    """Random edges of one host: pixels, depths, targets a few pixels from their predictions, a bent lens."""
+    """Random edges of one host: pixels, depths, targets a few pixels from their predictions, a lens of three terms."""
 
     def __init__(self, seed: int, edges: int = 2, points: int = 12) -> None:
         rng = np.random.default_rng(seed)
-        self.g = np.array([np.log(rng.uniform(240, 500)), rng.uniform(-0.1, 0.15), 155.0, 118.0])
+        focal, k, m, n = rng.uniform([240, -0.1, -0.08, -0.05], [500, 0.15, 0.1, 0.1])
+        self.g = np.array([np.log(focal), k, *rng.uniform([150, 112], [165, 125]), m, n])
         self.px = rng.uniform([0, 0], [320, 240], (points, 2))
         self.depth = rng.uniform(0.1, 1.0, points)
         self.pose = np.stack([se3_exp(rng.uniform(-0.12, 0.12, 6)) for _ in range(edges)])
         self.weight = rng.uniform(0.1, 1, (edges, points))
-        self.target = np.stack([self.px - self.residual(np.zeros(11), t, self.px) for t in self.pose]) + rng.normal(
-            0, 3, (edges, points, 2)
-        )
+        self.target = np.stack(
+            [self.px - self.residual(np.zeros(DEPTH + 1), t, self.px) for t in self.pose]
+        ) + rng.normal(0, 3, (edges, points, 2))
 
     def residual(self, x: Array, pose: Array, target: Array) -> Array:
-        """(p, 2) residuals after a step x = [pose (6), lens (4), depth]."""
-        r, z = edge_residuals(self.px, self.depth + x[10], target, se3_exp(x[:6]) @ pose, self.g + x[6:10])
+        """(p, 2) residuals after a step x = [pose (6), lens (6), depth]."""
+        r, z = edge_residuals(self.px, self.depth + x[DEPTH], target, se3_exp(x[:6]) @ pose, self.g + x[6:DEPTH])
         assert (z > MIN_DEPTH).all()
         return r
 
     def jacobian(self, e: int) -> Array:
-        """(p, 2, 11) of the prediction, by central differences: minus that of the residual."""
+        """(p, 2, 13) of the prediction, by central differences: minus that of the residual."""
         columns = []
-        for i in range(11):
-            step = np.zeros(11)
-            step[i] = 1e-3 if i in (8, 9) else 1e-6
+        for i in range(DEPTH + 1):
+            step = np.zeros(DEPTH + 1)
+            step[i] = STEP[i]
             high = self.residual(step, self.pose[e], self.target[e])
             low = self.residual(-step, self.pose[e], self.target[e])
             columns.append(-(high - low) / (2 * step[i]))
@@ -62,20 +67,23 @@ class Edges:
 
 
 def close(found: Array, wanted: Array, tolerance: float = 2e-5) -> None:
-    """Equal up to ``tolerance`` of the largest entry of each column (units differ between columns)."""
-    size = np.abs(wanted).reshape(-1, wanted.shape[-1]).max(0) + 1e-9
+    """Equal up to ``tolerance`` of the largest entry of each column (units differ between columns).
+
+    Differences carry the rounding of the whole residual, so a column below 1e-8 of the largest one says nothing.
+    """
+    size = np.abs(wanted).reshape(-1, wanted.shape[-1]).max(0) + 1e-8 * np.abs(wanted).max() + 1e-9
     np.testing.assert_allclose(found / size, wanted / size, atol=tolerance)
 
 
 @QUICK
 @given(seeds)
-def test_all_ten_columns_and_the_depth_agree_with_finite_differences(seed: int) -> None:
+def test_all_columns_and_the_depth_agree_with_finite_differences(seed: int) -> None:
     s = Edges(seed)
     hess, rhs, cross, hdd, bd, cost = host_system(*s.args(), WIDE_PX)
     for e in range(len(s.pose)):
-        r = s.residual(np.zeros(11), s.pose[e], s.target[e])
+        r = s.residual(np.zeros(DEPTH + 1), s.pose[e], s.target[e])
         jac, w = s.jacobian(e), s.weight[e]
-        j, jd = jac[..., :10], jac[..., 10]
+        j, jd = jac[..., :DEPTH], jac[..., DEPTH]
         close(hess[e], np.einsum("p,pri,prj->ij", w, j, j))
         close(rhs[e][None], np.einsum("p,pri,pr->i", w, j, r)[None], 1e-4)
         close(cross[e], np.einsum("p,pri,pr->pi", w, j, jd))
@@ -92,11 +100,11 @@ def test_each_column_by_itself(seed: int) -> None:
     jac = s.jacobian(0)[0]
     hess, rhs, cross, hdd, _, _ = host_system(*s.args(), WIDE_PX)
     w = s.weight[0, 0]
-    close(np.sqrt(np.diag(hess[0]))[None], np.sqrt(w) * np.linalg.norm(jac[:, :10], axis=0)[None], 1e-4)
-    close(cross[0], w * (jac[:, :10].T @ jac[:, 10])[None], 1e-4)
-    r = s.residual(np.zeros(11), s.pose[0], s.target[0])[0]
-    close(rhs[0][None], w * (jac[:, :10].T @ r)[None], 1e-3)
-    assert hdd[0, 0] == pytest.approx(w * (jac[:, 10] ** 2).sum(), rel=1e-4)
+    close(np.sqrt(np.diag(hess[0]))[None], np.sqrt(w) * np.linalg.norm(jac[:, :DEPTH], axis=0)[None], 1e-4)
+    close(cross[0], w * (jac[:, :DEPTH].T @ jac[:, DEPTH])[None], 1e-4)
+    r = s.residual(np.zeros(DEPTH + 1), s.pose[0], s.target[0])[0]
+    close(rhs[0][None], w * (jac[:, :DEPTH].T @ r)[None], 1e-3)
+    assert hdd[0, 0] == pytest.approx(w * (jac[:, DEPTH] ** 2).sum(), rel=1e-4)
 
 
 @QUICK
@@ -144,13 +152,95 @@ def test_pose_system_is_the_schur_complement_of_the_joint_system(seed: int) -> N
     rows = np.zeros((2 * n, 6 + n))
     rows[:, :6] = jac[..., :6].reshape(2 * n, 6)
     for k in range(n):
-        rows[2 * k : 2 * k + 2, 6 + k] = jac[k, :, 10]
-    r = s.residual(np.zeros(11), s.pose[0], s.target[0]).reshape(-1)
+        rows[2 * k : 2 * k + 2, 6 + k] = jac[k, :, DEPTH]
+    r = s.residual(np.zeros(DEPTH + 1), s.pose[0], s.target[0]).reshape(-1)
     joint, rhs = rows.T @ rows, rows.T @ r
     joint[range(6, 6 + n), range(6, 6 + n)] += info
     gain = joint[:6, 6:] @ np.linalg.inv(joint[6:, 6:])
     close(found_h, joint[:6, :6] - gain @ joint[6:, :6], 1e-4)
     close(found_b[None], (rhs[:6] - gain @ rhs[6:])[None], 1e-3)
+
+
+def plain_residual(s: Edges, e: int, n: int) -> Array:
+    """One residual written out from the definition, the lens inverted by bisection."""
+    f, k, centre, m, n3 = np.exp(s.g[0]), s.g[1], s.g[2:4], s.g[4], s.g[5]
+
+    def bent(r: float) -> float:
+        return float(r * (1 + k * r**2 + m * r**4 + n3 * r**6))
+
+    at = (s.px[n] - centre) / f
+    radius = float(np.linalg.norm(at))
+    point = s.pose[e][:3, :3] @ [*(at * bent(radius) / radius), 1.0] + s.pose[e][:3, 3] * s.depth[n]
+    q = point[:2] / point[2]
+    low, high = 0.0, fold_radius(k, m, n3)[0]  # one root in there, as the slope is positive
+    for _ in range(80):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if bent(middle) < np.linalg.norm(q) else (low, middle)
+    return np.asarray(s.target[e, n] - centre - f * low * q / np.linalg.norm(q))
+
+
+@QUICK
+@given(seeds)
+def test_the_residual_is_the_one_of_the_definition(seed: int) -> None:
+    s = Edges(seed)
+    for e in range(2):
+        found, _ = edge_residuals(s.px, s.depth, s.target[e], s.pose[e], s.g)
+        np.testing.assert_allclose(found, [plain_residual(s, e, n) for n in range(len(s.px))], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "terms", [(-0.3, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, -0.2, 0.0), (0.1, 0.0, -0.1), (0.2, -0.3, 0.02)]
+)
+def test_the_fold_is_where_the_slope_falls_below_a_tenth(terms: tuple[float, float, float]) -> None:
+    k, m, n = terms
+
+    def slope(r: float) -> float:
+        return 1 + 3 * k * r**2 + 5 * m * r**4 + 7 * n * r**6
+
+    bent_r, straight_r = fold_radius(*terms)
+    assert 0 < bent_r < 2.99
+    assert slope(bent_r) >= 0.1 > slope(bent_r + 0.0101)
+    assert min(slope(r) for r in np.linspace(0, bent_r, 200)) >= 0.1 - 1e-6
+    assert straight_r == pytest.approx(bent_r * (1 + k * bent_r**2 + m * bent_r**4 + n * bent_r**6), rel=1e-6)
+
+
+def test_lenses_that_never_fold() -> None:
+    assert min(fold_radius(0.0, 0.0, 0.0)) > 1e8
+    assert fold_radius(0.1, 0.05, 0.0)[0] == pytest.approx(3.0, abs=0.011)  # as far as anything is looked for
+
+
+def test_beyond_the_fold_a_point_costs_what_one_behind_the_camera_does() -> None:
+    """No pixel shows it: it has a fixed cost and no slope, and points within the fold are not touched by it."""
+    g = np.array([np.log(200.0), -0.3, 160.0, 120.0, 0.0, 0.0])
+    _, straight_r = fold_radius(g[1], g[4], g[5])
+    depth, pose = np.ones(2), np.eye(4)
+    pose[0, 3] = straight_r + 0.05  # the principal point's ray lands just beyond the fold
+    px = np.array([[160.0, 120.0], [160.0 - 150.0, 120.0]])
+    target, weight = px[None].copy(), np.array([[0.5, 0.8]])
+    r, z = edge_residuals(px, depth, target[0], pose, g)
+    assert (r[0] == 1e3).all() and z[0] < MIN_DEPTH and z[1] == pytest.approx(1.0) and np.abs(r[1]).max() < 400
+    hess, rhs, cross, hdd, bd, cost = host_system(px, depth, target, weight, pose[None], g, 2.0)
+    alone = host_system(px[1:], depth[1:], target[:, 1:], weight[:, 1:], pose[None], g, 2.0)
+    np.testing.assert_allclose(hess, alone[0])
+    np.testing.assert_allclose(rhs, alone[1])
+    assert (cross[0, 0] == 0).all() and hdd[0, 0] == bd[0, 0] == 0
+    assert cost[0] == pytest.approx(alone[5][0] + 0.5 * 4 * 2.0**2)
+    np.testing.assert_allclose(host_cost(px, depth, target, weight, pose[None], g, 2.0), cost)
+    pose_hess, _, pose_cost = pose_system(px, depth, np.ones(2), target[0], weight[0], pose, g, 2.0)
+    one_hess, _, one_cost = pose_system(px[1:], depth[1:], np.ones(1), target[0, 1:], weight[0, 1:], pose, g, 2.0)
+    np.testing.assert_allclose(pose_hess, one_hess)
+    assert pose_cost == pytest.approx(one_cost + 0.5 * 4 * 2.0**2)
+
+
+def test_the_lens_is_inverted_up_to_the_fold() -> None:
+    """Without a motion every pixel predicts itself, to where the lens is almost flat."""
+    for k, m, n in ((-0.3, 0.0, 0.0), (-0.2, 0.05, -0.02), (0.3, 0.1, 0.05), (0.15, -0.3, 0.02)):
+        g = np.array([np.log(200.0), k, 160.0, 120.0, m, n])
+        fold, _ = fold_radius(k, m, n)
+        radius = 200.0 * np.linspace(0.01, min(0.97 * fold, 1.4), 30)
+        px = np.stack([160 + radius * 0.8, 120 + radius * 0.6], 1)
+        r, z = edge_residuals(px, np.ones(30), px, np.eye(4), g)
+        assert (z > MIN_DEPTH).all() and np.abs(r).max() < 1e-3
 
 
 def test_sure_and_unknown_depths_are_the_limits_of_pose_system() -> None:

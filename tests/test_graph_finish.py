@@ -27,9 +27,9 @@ def world_from(scene: Any, k: int) -> Array:
 def tracked_graph(scene: Any, lost: set[int], noise_px: float = 0.2, count: int = 13) -> KeyframeGraph:
     """Frames 0 … count - 1 of the scene; 0, 6, 12 are keyframes with true depths; guesses are a little off."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
     graph.lens.g = scene.lens.copy()
-    graph.initialised = True
+    graph.started.add(0)
     p, rng = len(scene.px), np.random.default_rng(0)
     nothing_moves = np.zeros((scene.height, scene.width))
     for k in range(count):
@@ -102,7 +102,7 @@ def test_a_run_that_never_saw_anything_has_no_pose(scene: Any) -> None:
 
 def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
     p = len(scene.px)
     graph.add_keyframe(scene.work_frame(0), np.ones(p), np.zeros((240, 320)), np.eye(4), np.ones(p), np.ones(p))
     with pytest.raises(InputError, match=r"camera never moves enough: expected .* 6% .*, got 1 view"):

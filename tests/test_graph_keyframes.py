@@ -17,14 +17,8 @@ from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import procrustes
 from mastd3r.graph.bootstrap import bootstrap
 from mastd3r.graph.depth import carried, filled, trust, upsampled
-from mastd3r.graph.keyframe_graph import (
-    KeyframeGraph,
-    camera_of,
-    lens_for,
-    radial_from_undistortion,
-    undistortion_from_radial,
-)
-from mastd3r.graph.places import PlaceIndex, covisible, overlap
+from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
+from mastd3r.graph.places import PlaceIndex, covisible, nearest_keyframe, overlap
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.types import Matches
 from mastd3r.view_depth import rigid_flow
@@ -38,7 +32,7 @@ def graph_of(
     """A graph with matches between all views; ``solved``: with true poses and depths, otherwise with none."""
     camera = camera or CameraConfig()
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), camera, lens_for(camera, *size, size))
+    graph = KeyframeGraph(GraphConfig(), lens_for(camera, *size, size))
     p = len(scene.px)
     nothing_moves = np.zeros((scene.height, scene.width))
     for k in range(views):
@@ -51,7 +45,7 @@ def graph_of(
                 graph.connect(i, j, scene.matches(i, j, noise_px), np.ones(p))
     if solved:
         graph.lens.g = scene.lens.copy()
-        graph.initialised = True
+        graph.started.add(0)
         for k in range(views):
             graph.blocks[k].depth_info = np.full(p, 1e4)
     return graph
@@ -176,39 +170,23 @@ def test_a_record_keeps_the_strongest_matches(exact_scene: Callable[..., Any]) -
     np.testing.assert_allclose(entry.target, scene.matches(0, 1).new_px[entry.points], atol=1e-4)
 
 
-@pytest.mark.parametrize("k", [-0.12, -0.03, 0.0, 0.05, 0.1])
-def test_the_camera_inverts_the_solvers_undistortion(k: float) -> None:
-    """u = x (1 + k x²) there, x = u (1 + k1 u²) here: the fitted k1 undoes it to a fraction of a pixel."""
-    size, focal_px = (320, 240), 260.0
-    k1 = radial_from_undistortion(focal_px, k, size)
-    assert np.sign(k1) == -np.sign(k)
-    lens = lens_for(CameraConfig(), *size, size)
-    lens.g[:2] = np.log(focal_px), k
-    camera = camera_of(lens, size)
-    assert camera.k1 == pytest.approx(k1) and camera.fx_px == pytest.approx(focal_px)
-    px = camera.pixel_grid()[::16, ::16].reshape(-1, 2)
-    x = (px - lens.g[2:]) / focal_px
-    u = x * (1 + k * (x**2).sum(1, keepdims=True))
-    back = camera.project(np.concatenate([u, np.ones((len(u), 1))], 1))
-    assert np.abs(back - px).max() < 1.0 and np.sqrt(((back - px) ** 2).sum(1).mean()) < 0.4
-
-
-def test_given_intrinsics_are_scaled_and_fixed() -> None:
-    lens = lens_for(CameraConfig(intrinsics=(600.0, 610.0, 320.0, 239.0)), 320, 240, (640, 480))
-    assert np.exp(lens.g[0]) == pytest.approx(np.sqrt(300 * 305))
-    np.testing.assert_allclose(lens.g[2:], [(320.5) / 2 - 0.5, (239.5) / 2 - 0.5])
-    assert not lens.free.any()
-    unknown = lens_for(CameraConfig(estimate_radial=False), 320, 240, (640, 480))
-    np.testing.assert_array_equal(unknown.free, [True, False, False, False])
-    assert lens_for(CameraConfig(), 320, 240, (640, 480)).free[:2].all()
-
-
-def test_a_given_radial_term_reaches_the_solver_and_comes_back() -> None:
-    size = (320, 240)
-    for k1 in (-0.1, 0.04):
-        lens = lens_for(CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5, k1)), *size, size)
-        assert lens.g[1] == undistortion_from_radial(260.0, k1, size) and np.sign(lens.g[1]) == -np.sign(k1)
-        assert camera_of(lens, size).k1 == pytest.approx(k1, abs=0.15 * abs(k1))
+@pytest.mark.parametrize(
+    ("views", "window", "everything"),
+    [(6, (0,), (0, 1)), (7, (0,), (0, 1)), (8, (0, 1), (0, 1)), (11, (0, 1, 2, 3, 4, 5), (0, 1, 2, 3, 4, 5))],
+)
+def test_the_lens_is_freed_as_views_come(
+    exact_scene: Callable[..., Any], views: int, window: tuple[int, ...], everything: tuple[int, ...]
+) -> None:
+    """Focal length first; the first radial term with everything, or from ``radial_keyframes``; then the rest."""
+    scene = exact_scene(views, step=0.02, cell_px=60)
+    graph = graph_of(scene, views, noise_px=0.3, solved=True)
+    graph.config = replace(graph.config, radial_keyframes=8, lens_keyframes=11)
+    before = graph.lens.g.copy()
+    graph.solve_window()
+    np.testing.assert_array_equal(np.flatnonzero(graph.lens.g != before), window)
+    graph.lens.g = before.copy()
+    graph.solve_all(2, 1.0)
+    np.testing.assert_array_equal(np.flatnonzero(graph.lens.g != before), everything)
 
 
 @pytest.mark.parametrize("k", [0.0, -0.05])
@@ -312,27 +290,59 @@ def test_covisible_takes_the_nearest_and_no_neighbours(exact_scene: Callable[...
     assert covisible(graph, 8, 7, 4, 0.5) == []
 
 
+def test_nearest_keyframe_is_the_one_with_the_least_motion(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(9, step=0.05)
+    graph = graph_of(scene, 9, solved=True)
+    pose = scene.cam_from_world[2] @ inverse(scene.cam_from_world[0])  # the camera is back at view 2
+    assert nearest_keyframe(graph, pose, 8, 0.8, 0.06) == 2
+    second = nearest_keyframe(graph, pose, 2, 0.8, 0.06)
+    assert second in (1, 3)
+    assert nearest_keyframe(graph, pose, 2, 0.8, 1e-4) is None  # none is that near
+    graph.submap_of[2] = 7  # of a submap that is not being tracked
+    assert nearest_keyframe(graph, pose, 8, 0.8, 0.06) == second
+    assert nearest_keyframe(graph, se3_exp(np.array([0, 0, 0, 0, np.pi, 0])), 8, 0.8, 0.06) is None
+
+
 def test_places_know_a_picture_again(exact_scene: Callable[..., Any], room_views: list[SyntheticView]) -> None:
     scene = exact_scene(4)
-    graph = KeyframeGraph(GraphConfig(), CameraConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
+    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
     grays = [v.frame.image[..., 1] for v in room_views[:2]] + [room_views[0].frame.image[:, ::-1, 1]]
     p = len(scene.px)
     for k, gray in enumerate(grays):
         work = replace(scene.work_frame(k), gray=np.ascontiguousarray(gray))
         graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
     index = PlaceIndex()
-    like_first = np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8)  # brighter
-    assert index.best(graph, like_first, skip=-1)[0].id == 0
-    assert index.best(graph, grays[2], skip=-1)[0].id == 2
-    assert [kf.id for kf in index.best(graph, like_first, skip=0, count=1)] == [1]
-    graph.clear()
-    assert index.best(graph, like_first, skip=-1) == []
+    first, third = (graph.keyframes[k].work for k in (0, 2))
+    like_first = replace(first, gray=np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8))  # brighter
+    assert index.best(graph, like_first, [0, 1, 2])[0].id == 0
+    assert index.best(graph, third, [0, 1, 2])[0].id == 2
+    assert [kf.id for kf in index.best(graph, like_first, [1, 2], count=1)] == [1]
+    assert len(index.best(graph, like_first, [0, 1, 2], count=2)) == 2
+    assert index.best(graph, like_first, []) == []
 
 
-def test_clearing_leaves_lost_frames(exact_scene: Callable[..., Any]) -> None:
+def test_places_are_of_the_keyframes_there_are_now(
+    exact_scene: Callable[..., Any], room_views: list[SyntheticView]
+) -> None:
+    """A number that was given to another keyframe after a submap was dropped is looked at anew."""
+    scene = exact_scene(2)
+    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
+    gray = room_views[0].frame.image[..., 1]
+    p = len(scene.px)
+    index = PlaceIndex()
+    for n, images in enumerate(([gray, 255 - gray], [255 - gray, gray])):
+        for k, image in enumerate(images):
+            work = replace(scene.work_frame(2 * n + k), gray=np.ascontiguousarray(image))
+            graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
+        assert index.best(graph, replace(work, gray=np.ascontiguousarray(gray)), [0, 1])[0].id == n
+        graph.drop_submap()
+
+
+def test_dropping_the_only_submap_leaves_lost_frames(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(2)
     graph = graph_of(scene, 2)
     none = Matches(scene.px, scene.px, np.zeros(len(scene.px)))
     graph.record(scene.work_frame(0), 0, np.eye(4), "tracked", none, none.weight)
-    graph.clear()
+    graph.drop_submap()
     assert [r.state for r in graph.records] == ["lost"] and graph.keyframes == [] and graph.edges == []
+    assert graph.blocks == {} and graph.submap_of == {} and not graph.initialised

@@ -66,7 +66,7 @@ class GraphConfig:
     """Joint optimisation over keyframes."""
 
     bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
-    radial_keyframes: int = 12  # keyframes before the first radial term is estimated
+    radial_keyframes: int = 12  # keyframes before the first radial term is estimated in the window
     lens_keyframes: int = 32  # keyframes before principal point and higher radial terms are
     neighbours: int = 6  # previous keyframes that a new one is matched with
     covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with

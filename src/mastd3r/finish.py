@@ -32,9 +32,14 @@ class FinalFrame:
     state: State
 
 
-def finish_graph(graph: KeyframeGraph, config: Config) -> None:
-    """Start what never started, then optimise everything. Raises InputError for a camera that never moves."""
+def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = True) -> bool:
+    """Start what never started, then optimise everything. False where nothing ever started.
+
+    ``needs_motion``: depth comes from the camera's motion; InputError is raised for one that never moves.
+    """
     if not graph.started and (len(graph.members()) < 2 or not bootstrap(graph)):
+        if not needs_motion:
+            return False
         raise InputError(
             f"the camera never moves enough: expected image motion of at least "
             f"{config.tracking.first_motion_ratio:.0%} of the image with parallax, got "
@@ -46,6 +51,7 @@ def finish_graph(graph: KeyframeGraph, config: Config) -> None:
         log.warning("frames %d to %d were never joined to the rest: placed by continuity", first, last)
     log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
              len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
+    return True
 
 
 def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:

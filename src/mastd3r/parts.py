@@ -124,7 +124,8 @@ def _mast3r(config: Config, source: Source) -> Parts:
         network, width, height, config.tracking.cell_px, matcher=match_on_host if device == "cpu" else match_there
     )
     note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, working image {width}x{height}"
-    return Parts(provider, (width, height), notes=[note], own_scale_known=False)
+    places = PlaceIndex(provider.place_descriptor)
+    return Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)
 
 
 def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:

@@ -129,7 +129,9 @@ class _Job:
             seen = self._look_again(lens_view)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
         self.folder.write_cloud(cloud)
-        if self.config.mapping.enabled:
+        if self.config.mapping.enabled and not (seen.views and len(cloud.points_world)):
+            self.folder.note(f"no map: {len(seen.views)} frames can show it, {len(cloud.points_world)} points start it")
+        elif self.config.mapping.enabled:
             with self._timed("map"):
                 mapper = self._map(cloud, seen)
             with self._timed("renders"):
@@ -152,7 +154,12 @@ class _Job:
         return count
 
     def _solve(self) -> None:
-        finish_graph(self.slam.graph, self.config)
+        provider = self.slam.parts.provider
+        if not finish_graph(self.slam.graph, self.config, needs_motion=provider.depth_sigma_ratio is None):
+            self.folder.note(
+                f"pointmaps {provider.name}: no depth was measured, no frame could be followed; every frame is given "
+                "one pose, and neither path, cloud nor map mean anything"
+            )
         self._final = final_frames(self.slam.graph)
         self._write_trajectory()
 
@@ -169,6 +176,8 @@ class _Job:
             "focal_px": self._focal_px(),
             "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
             "k1": camera.k1,
+            "k2": camera.k2,
+            "k3": camera.k3,
             "found": "given" if self.config.camera.intrinsics else "from the video",
         }
         if isinstance(lens, OpenCvLens):

@@ -14,10 +14,12 @@ from .config import Config
 from .dynamics.belief import DynamicBelief
 from .geometry.se3 import inverse
 from .graph.bootstrap import bootstrap
+from .graph.bundle import Lens
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
 from .graph.places import covisible, nearest_keyframe
 from .graph.submaps import join, scale_between
 from .parts import Parts
+from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
 from .types import Frame, Guess, State, WorkFrame
 from .view_depth import (
@@ -34,6 +36,7 @@ from .view_depth import (
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,16 @@ class StepReport:
     kf_id: int
     is_keyframe: bool
     why: str
+
+
+def started_at(lens: Lens, work: WorkFrame, size: tuple[int, int]) -> Lens:
+    """The lens with the focal length that the frame's own points speak of, where they do and a camera may have it."""
+    focal_px = work.focal_px if isinstance(work, NetworkFrame) else None
+    low, high = FOCAL_RATIOS_BELIEVED
+    if focal_px is None or not low < focal_px / np.sqrt(size[0] * size[1]) < high:
+        return lens
+    g = np.concatenate([[np.log(focal_px)], lens.g[1:]])
+    return Lens(g, g.copy(), lens.prior_info)
 
 
 class Slam:
@@ -68,7 +81,7 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
-        work = self.parts.provider.observe(frame)
+        work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
         prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
@@ -101,7 +114,7 @@ class Slam:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
         graph = self.graph
         ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
-        candidates = self.parts.places.best(graph, work.gray, ids)
+        candidates = self.parts.places.best(graph, work, ids)
         if self._before_loss is not None:
             candidates = [self._before_loss, *(kf for kf in candidates if kf.id != self._before_loss.id)]
         for kf in candidates:
@@ -124,7 +137,7 @@ class Slam:
             near = self.comparer.compare(kf, work, prior, None, np.eye(4))
             if self.comparer.believed(near):
                 return kf, near
-        places = self.parts.places.best(graph, work.gray, graph.members())
+        places = self.parts.places.best(graph, work, graph.members())
         for kf in [self._ref, *(p for p in places if p.id != self._ref.id)]:
             view = self.comparer.recognised(kf, work, prior)
             if view is not None:
@@ -156,6 +169,8 @@ class Slam:
 
     def _start(self, work: WorkFrame, prior: Array, why: str) -> StepReport:
         graph = self.graph
+        if not graph.started and not self.config.camera.intrinsics:
+            graph.lens = started_at(graph.lens, work, graph.size)
         sigma = self.parts.provider.depth_sigma_ratio
         inv_depth, info = own_depth_prior(work, 1.0, sigma)
         kf = graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
@@ -253,7 +268,7 @@ class Slam:
         graph = self.graph
         own = graph.submap_of[kf.id]
         others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
-        for other in self.parts.places.best(graph, kf.work.gray, others):
+        for other in self.parts.places.best(graph, kf.work, others):
             view = self.comparer.recognised(other, kf.work, kf.moving / 255.0)
             if view is None:
                 continue

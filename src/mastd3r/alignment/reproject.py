@@ -24,7 +24,7 @@ class StaticMatches:
     depth_info: Array  # (p,) 1/variance of it, unit pixel noise
     target: Array  # (p, 2) in new
     weight: Array  # (p,)
-    lens: Array  # (4,) log f, k, cx, cy
+    lens: Array  # (6,) log f, k, cx, cy, m, n
 
     @property
     def count(self) -> int:

@@ -208,7 +208,8 @@ class KeyframeGraph:
         whole = len(near) == n and n <= size
         fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
         moves = n <= 2 * size or n % 4 == 0
-        lens = self._lens_with(() if moves else range(N_GLOBAL))
+        early = RADIAL if len(self.keyframes) < self.config.radial_keyframes else ()
+        lens = self._lens_with(early if moves else range(N_GLOBAL))
         report = solve(
             {k: self.blocks[k] for k in sorted(near)},
             edges,
@@ -241,8 +242,6 @@ class KeyframeGraph:
     def _lens_with(self, fixed: Iterable[int]) -> Lens:
         """The lens with some unknowns fixed: those named, and those that too few views cannot tell apart."""
         hold = set(fixed)
-        if len(self.keyframes) < self.config.radial_keyframes:
-            hold |= set(RADIAL)
         if len(self.keyframes) < self.config.lens_keyframes:
             hold |= set(LATE)
         info = np.where(np.isin(np.arange(N_GLOBAL), list(hold)), np.inf, self.lens.prior_info)
@@ -254,7 +253,7 @@ class KeyframeGraph:
         Where depths are measured (strong priors) the scale is theirs and nothing is done.
         """
         first = [self.blocks[k] for k in sorted(self.blocks)[:3]]
-        if any((b.prior_info * b.inv_depth**2 > 100).mean() > 0.1 for b in first):
+        if any((b.prior_info * b.inv_depth**2 > 25).mean() > 0.1 for b in first):
             return
         m = float(np.median([self.median_inv_depth(k) for k in sorted(self.blocks)[:3]]))
         if not np.isfinite(m) or m <= 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import cv2
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.se3 import inverse, transform
+from ..types import WorkFrame
 from .keyframe_graph import Keyframe, KeyframeGraph
 
 Array = NDArray[Any]
@@ -70,19 +71,23 @@ def thumbnail(gray: Array) -> Array:
 
 
 class PlaceIndex:
-    """Place recognition: keyframes whose thumbnails look most alike. Nothing is believed before it is verified."""
+    """Place recognition: keyframes whose descriptors are most alike. Nothing is believed before it is verified.
 
-    def __init__(self) -> None:
-        self._known: dict[int, tuple[int, Array]] = {}  # keyframe: (frame, thumbnail)
+    ``describe`` gives a frame's descriptor, (c,) of unit norm: a thumbnail, or what a network has of it.
+    """
 
-    def best(self, graph: KeyframeGraph, gray: Array, among: Collection[int], count: int = 3) -> list[Keyframe]:
-        """Up to ``count`` keyframes of ``among`` that look most like ``gray``, best first."""
+    def __init__(self, describe: Callable[[WorkFrame], Array] | None = None) -> None:
+        self._describe = describe or (lambda work: thumbnail(work.gray))
+        self._known: dict[int, tuple[int, Array]] = {}  # keyframe: (frame, descriptor)
+
+    def best(self, graph: KeyframeGraph, seen: WorkFrame, among: Collection[int], count: int = 3) -> list[Keyframe]:
+        """Up to ``count`` keyframes of ``among`` that look most like ``seen``, best first."""
         if not among:
             return []
         for k in among:
             work = graph.keyframes[k].work
             if k not in self._known or self._known[k][0] != work.index:
-                self._known[k] = (work.index, thumbnail(work.gray))
+                self._known[k] = (work.index, self._describe(work))
         ids = sorted(among)
-        likeness = np.stack([self._known[k][1] for k in ids]) @ thumbnail(gray)
+        likeness = np.stack([self._known[k][1] for k in ids]) @ self._describe(seen)
         return [graph.keyframes[ids[n]] for n in np.argsort(-likeness, kind="stable")[:count]]
