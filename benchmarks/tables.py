@@ -61,8 +61,51 @@ def main() -> int:
         lines.append(f"| {name} | `{entry['command']}` | {when} | {machine} |")
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
+    lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
+
+
+def endurance(path: Path) -> list[str]:
+    """Loops, blackouts, long runs: what benchmarks/endurance.py wrote, or nothing."""
+    if not path.is_file():
+        return []
+    entries: dict[str, dict[str, Any]] = json.loads(path.read_text())
+    out = ["", "## Loops, blackouts, long runs", "", "By `python benchmarks/endurance.py --data SEQUENCE --what"]
+    out[-1] += f" {' '.join(entries)} --out {path.as_posix()}`. Time is processor time of all threads."
+    out += ["", "| run | frames | states | ATE all [m] | end from start [m] | keyframes at each quarter |"]
+    out[-1] += " s a frame, each quarter | memory at each quarter [MiB] |"
+    out.append("|---" * 8 + "|")
+    for name, e in entries.items():
+        states = ", ".join(f"{n} {s}" for s, n in e["states"].items())
+        times = ", ".join(f"{t:.3f}" for t in e["cpu_s_per_frame_by_quarter"])
+        end = "–" if e["end_from_start_m"] is None else f"{e['end_from_start_m']:.2g}"
+        grown = ", ".join(map(str, e["keyframes_at_quarters"]))
+        memory = ", ".join(map(str, e["memory_mib_at_quarters"]))
+        cells = [f"{e['sequence']}, {name}", e["frames"], states, f"{e['ate_rmse_all']:.4f}", end, grown, times, memory]
+        out.append("| " + " | ".join(map(str, cells)) + " |")
+    return out
+
+
+def reference(path: Path) -> list[str]:
+    """Our MASt3R against the public one with equal random weights: benchmarks/compare_reference.py, or nothing."""
+    if not path.is_file():
+        return []
+    e: dict[str, Any] = json.loads(path.read_text())
+    out = ["", "## MASt3R's network against the reference implementation", ""]
+    out.append(
+        f"Equal random weights, {e['parameters']:,} parameters under {e['names']} names, {e['own_precision']} on the "
+        f"{e['device']}, {e['threads']} threads. By `python benchmarks/compare_reference.py --reference DIR --out "
+        f"{path.as_posix()}`; DIR is the reader's own checkout of the reference, which is not part of this repository."
+    )
+    out += ["", "| size | largest relative error: points | confidence | descriptors | descriptor confidence |"]
+    out.append("|---" * 5 + "|")
+    for pair in e["pairs"]:
+        worst = pair["max_relative_error"]
+        kinds = ("points", "confidence", "descriptors", "descriptor_confidence")
+        cells = [f"{max(worst[k + '1'], worst[k + '2']):.1e}" for k in kinds]
+        out.append(f"| {pair['size']} | " + " | ".join(cells) + " |")
+    return out
 
 
 def _cell(value: Any, form: str) -> str:
