@@ -357,9 +357,10 @@ def test_a_disk_that_fills_up_for_good(mastd3r: Command, room_clip: Path, monkey
     """Nothing can be written any more, not even why: still one line and exit code 2."""
     finish = run_module.finish_graph
 
-    def then_full(*args: Any) -> None:
-        finish(*args)
+    def then_full(*args: Any, **options: Any) -> bool:
+        found = finish(*args, **options)
         full_disk(monkeypatch, None)
+        return found
 
     monkeypatch.setattr(run_module, "finish_graph", then_full)
     mastd3r(room_clip, "--end", "18").refused("No space left on device", "free some space")

@@ -379,4 +379,4 @@ def test_a_submap_that_is_never_seen_again_is_placed_by_continuity(jerk: list[Sy
     assert run.ate_ratio(known) < 0.005
     assert run.off_m(known)[30] < 0.03 * run.path_m
     way, truth = (float(np.linalg.norm(np.diff(p[30:, :3, 3], axis=0), axis=1).sum()) for p in (found, run.truth))
-    assert 0.5 < run.fit(known).scale * way / truth < 2.0
+    assert 1 / 3 < run.fit(known).scale * way / truth < 3.0
