@@ -43,7 +43,8 @@ LAYERS: dict[str, set[str]] = {
     "parts": {*CONTRACTS, *STAGES, "networks"},
     "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
-    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
+    "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare"},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "loops"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",

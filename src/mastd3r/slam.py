@@ -18,6 +18,7 @@ from .graph.bundle import Lens
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
 from .graph.places import covisible, nearest_keyframe
 from .graph.submaps import join, scale_between
+from .loops import close_loops, widen
 from .parts import Parts
 from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
@@ -164,6 +165,10 @@ class Slam:
         for submap in sorted(graph.started)[1:]:
             graph.submap = submap
             any(self._joins(graph.keyframes[k]) for k in graph.members())
+        for submap in sorted(graph.started):
+            graph.submap = submap
+            close_loops(self.comparer, graph, self.parts.places)
+            widen(graph, self._connect_both)
 
     # -- keyframes -------------------------------------------------------------------------------------------
 

@@ -258,14 +258,21 @@ class KeyframeGraph:
         m = float(np.median([self.median_inv_depth(k) for k in sorted(self.blocks)[:3]]))
         if not np.isfinite(m) or m <= 0:
             return
-        for b in self.blocks.values():
+        self.stretch(self.blocks, m)
+
+    def stretch(self, ids: Iterable[int], factor: float) -> None:
+        """Lengths of some keyframes, and of the frames that hang on them, times ``factor``: about the origin."""
+        chosen = set(ids)
+        for k in chosen:
+            b = self.blocks[k]
             b.cam_from_world = b.cam_from_world.copy()
-            b.cam_from_world[:3, 3] *= m
-            b.inv_depth, b.prior_depth = b.inv_depth / m, b.prior_depth / m
-            b.prior_info, b.depth_info = b.prior_info * m**2, b.depth_info * m**2
+            b.cam_from_world[:3, 3] *= factor
+            b.inv_depth, b.prior_depth = b.inv_depth / factor, b.prior_depth / factor
+            b.prior_info, b.depth_info = b.prior_info * factor**2, b.depth_info * factor**2
         for r in self.records:
-            r.cam_from_kf = r.cam_from_kf.copy()
-            r.cam_from_kf[:3, 3] *= m
+            if r.kf_id in chosen:
+                r.cam_from_kf = r.cam_from_kf.copy()
+                r.cam_from_kf[:3, 3] *= factor
 
     def connected(self, i: int, j: int) -> bool:
         """True where matches of one in the other are edges."""

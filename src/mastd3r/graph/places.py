@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.se3 import inverse, transform
+from ..geometry.se3 import inverse
 from ..types import WorkFrame
 from .keyframe_graph import Keyframe, KeyframeGraph
 
@@ -18,16 +18,25 @@ Array = NDArray[Any]
 
 def overlap(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[float, float]:
     """(share of keyframe i's points inside the view, their median image motion / width) under current poses."""
+    share, motion = overlaps(graph, i, cam_from_world[None])
+    return float(share[0]), float(motion[0])
+
+
+def overlaps(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[Array, Array]:
+    """The same for m views (m, 4, 4): shares (m,) and motions (m,), inf where nothing is in view."""
     block, camera = graph.blocks[i], graph.camera().pinhole
     px = block.px[::4]
-    rays = camera.rays(px)
-    points = transform(cam_from_world @ inverse(block.cam_from_world), rays / block.inv_depth[::4, None])
-    front = points[:, 2] > 1e-3
-    seen = camera.project(np.where(front[:, None], points, 1.0))
-    inside = front & (seen >= 0).all(1) & (seen[:, 0] < camera.width) & (seen[:, 1] < camera.height)
-    if not inside.any():
-        return 0.0, float("inf")
-    return float(inside.mean()), float(np.median(np.linalg.norm(seen - px, axis=1)[inside]) / camera.width)
+    points = camera.rays(px) / block.inv_depth[::4, None]
+    view_from_ref = cam_from_world @ inverse(block.cam_from_world)
+    moved = points @ view_from_ref[:, :3, :3].transpose(0, 2, 1) + view_from_ref[:, None, :3, 3]
+    front = moved[..., 2] > 1e-3
+    seen = camera.project(np.where(front[..., None], moved, 1.0).reshape(-1, 3)).reshape(*front.shape, 2)
+    inside = front & (seen >= 0).all(2) & (seen[..., 0] < camera.width) & (seen[..., 1] < camera.height)
+    moved_px = np.where(inside, np.linalg.norm(seen - px, axis=2), np.nan)
+    motion = np.full(len(inside), np.inf)
+    some = inside.any(1)
+    motion[some] = np.nanmedian(moved_px[some], axis=1) / camera.width
+    return inside.mean(1), motion
 
 
 def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_overlap: float) -> list[int]:
@@ -80,8 +89,15 @@ class PlaceIndex:
         self._describe = describe or (lambda work: thumbnail(work.gray))
         self._known: dict[int, tuple[int, Array]] = {}  # keyframe: (frame, descriptor)
 
-    def best(self, graph: KeyframeGraph, seen: WorkFrame, among: Collection[int], count: int = 3) -> list[Keyframe]:
-        """Up to ``count`` keyframes of ``among`` that look most like ``seen``, best first."""
+    def best(
+        self,
+        graph: KeyframeGraph,
+        seen: WorkFrame,
+        among: Collection[int],
+        count: int = 3,
+        min_likeness: float = -1.0,
+    ) -> list[Keyframe]:
+        """Up to ``count`` keyframes of ``among`` that look most like ``seen``, best first; none below the likeness."""
         if not among:
             return []
         for k in among:
@@ -90,4 +106,5 @@ class PlaceIndex:
                 self._known[k] = (work.index, self._describe(work))
         ids = sorted(among)
         likeness = np.stack([self._known[k][1] for k in ids]) @ self._describe(seen)
-        return [graph.keyframes[ids[n]] for n in np.argsort(-likeness, kind="stable")[:count]]
+        first = np.argsort(-likeness, kind="stable")[:count]
+        return [graph.keyframes[ids[n]] for n in first if likeness[n] >= min_likeness]

@@ -52,17 +52,10 @@ def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, scale: float) ->
     stretched[:3, 3] *= scale
     b_from_a = inverse(stretched) @ cam_from_a  # both in a's lengths
     moved = graph.members(gone)
-    for r in graph.records:
-        if r.kf_id in moved:
-            r.cam_from_kf = r.cam_from_kf.copy()
-            r.cam_from_kf[:3, 3] *= scale
+    graph.stretch(moved, scale)
     for k in moved:
         block = graph.blocks[k]
-        pose = block.cam_from_world.copy()
-        pose[:3, 3] *= scale
-        block.cam_from_world = pose @ b_from_a
-        block.inv_depth, block.prior_depth = block.inv_depth / scale, block.prior_depth / scale
-        block.prior_info, block.depth_info = block.prior_info * scale**2, block.depth_info * scale**2
+        block.cam_from_world = block.cam_from_world @ b_from_a
         graph.submap_of[k] = keep
     graph.started.discard(gone)
     if graph.submap == gone:

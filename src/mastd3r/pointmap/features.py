@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from typing import Any
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
+KEPT = 64  # images whose features are remembered
 
 
 class FeatureStart:
@@ -18,11 +20,22 @@ class FeatureStart:
         self._orb = cv2.ORB.create(nfeatures=features, fastThreshold=8)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self.min_inliers = min_inliers
+        self._seen: OrderedDict[int, tuple[Array, Any, Any]] = OrderedDict()  # id of an image: it, points, descriptors
+
+    def _described(self, image: Array) -> tuple[Any, Any]:
+        """Points and descriptors of an image; those asked for last are kept, as keyframes come again and again."""
+        key = id(image)
+        if key not in self._seen:
+            self._seen[key] = (image, *self._orb.detectAndCompute(image, None))
+            if len(self._seen) > KEPT:
+                self._seen.popitem(last=False)
+        self._seen.move_to_end(key)
+        return self._seen[key][1:]
 
     def flow(self, ref: Array, new: Array) -> Array | None:
         """(h, w, 2) float32 flow of the homography ref -> new; None where too few features agree."""
-        points_ref, described_ref = self._orb.detectAndCompute(ref, None)
-        points_new, described_new = self._orb.detectAndCompute(new, None)
+        points_ref, described_ref = self._described(ref)
+        points_new, described_new = self._described(new)
         if described_ref is None or described_new is None:
             return None
         matches = self._matcher.match(described_ref, described_new)

@@ -13,6 +13,9 @@ from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
 from .flow import FlowMatcher, corner_grid
 
 Array = NDArray[Any]
+# Strength of a corner (``corner_grid``) in squared gradients of an image in 0..1: below FLAT its gradient is less than
+# a grey level, which is noise that flow follows wherever the smooth field leads it; from SURE on twice that.
+FLAT, SURE = 1e-5, 4e-5
 
 
 def working_size(width: int, height: int, area_px: int) -> tuple[int, int]:
@@ -37,6 +40,7 @@ class GeometricPointmaps:
         gray = cv2.resize(gray, (self.width, self.height), interpolation=cv2.INTER_AREA)
         px, strength = corner_grid(gray, self.cell_px)
         texture = np.clip(strength / max(0.5 * float(np.median(strength)), 1e-5), 0.0, 1.0)
+        texture *= np.clip((strength - FLAT) / (SURE - FLAT), 0.0, 1.0)
         semantic = None
         if frame.semantic is not None:
             semantic = cv2.resize(frame.semantic.astype(np.float32), (self.width, self.height))
