@@ -13,7 +13,7 @@ from rich.table import Table
 from .errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from .networks.fetch import Progress
+    from .fetch import Progress
     from .networks.weights_download import Accept
     from .networks.weights_known import Licence
     from .progress import Bar, Reporter
@@ -41,7 +41,7 @@ def weights_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _list(args: argparse.Namespace, console: Console) -> int:
-    from .networks.fetch import human_bytes
+    from .fetch import human_bytes
     from .networks.weights import entries, home
 
     table = Table("name", "here", "size", "licence", "what it is")
@@ -114,7 +114,7 @@ class _Bars:
 
 
 def _check(args: argparse.Namespace, console: Console) -> int:
-    from .networks.fetch import human_bytes
+    from .fetch import human_bytes
     from .networks.weights import check, entries
 
     names = [args.what] if args.what else [e.name for e in entries() if e.state == "installed"]

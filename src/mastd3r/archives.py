@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from .errors import InputError
 
 CHUNK_BYTES = 1 << 20
 ZIP_STARTS = (b"PK\x03\x04", b"PK\x05\x06")
