@@ -16,6 +16,7 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 from . import __version__
+from .cli_download import download_parser
 from .cli_weights import weights_parser
 from .config import Config, SourceKind, config_from_dict, config_from_yaml, config_to_yaml, with_override
 from .errors import ConfigError
@@ -78,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("run", type=Path)
     view.set_defaults(act=_view)
     weights_parser(commands.add_parser("weights", help="list, download and check the weights of the networks"))
+    download_parser(commands.add_parser("download", help="list and bring the public datasets"))
     doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=_doctor)
     return parser
