@@ -64,7 +64,7 @@ def depth_units(count: int, width: int, height: int, seed: int) -> list[Array]:
 
 def enlarged(images: list[Array], size: tuple[int, int]) -> list[Array]:
     """Small pictures at the size of the dataset's, each pixel a block: quick to write and to read."""
-    factor = size[0] // 64
+    factor = size[0] // images[0].shape[1]
     return [np.repeat(np.repeat(image, factor, 0), factor, 1) for image in images]
 
 
@@ -175,7 +175,7 @@ def kitti_raw(root: Path, count: int = 4) -> Miniature:
     """A drive with both left cameras. The car drives a known arc; its latitudes and longitudes are made from that."""
     day = root / "2011_09_26"
     folder = day / "2011_09_26_drive_0001_sync"
-    images = blobs(count, 62, 19)
+    images = enlarged(blobs(count, 414, 125), (1242, 375))
     clock = [f"2011-09-26 13:02:{25.964389445 + 0.1 * i:012.9f}" for i in range(count)]
     for camera in ("00", "02"):
         for i, image in enumerate(images):
@@ -188,7 +188,8 @@ def kitti_raw(root: Path, count: int = 4) -> Miniature:
         "calib_imu_to_velo.txt": f"R: {words(IMU_TO_VELO[:, :3])}\nT: {words(IMU_TO_VELO[:, 3])}\n",
         "calib_velo_to_cam.txt": f"R: {words(VELO_TO_CAM[:, :3])}\nT: {words(VELO_TO_CAM[:, 3])}\n"
         "delta_f: 0.000000e+00 0.000000e+00\n",
-        "calib_cam_to_cam.txt": f"corner_dist: 9.950000e-02\nR_rect_00: {words(R_RECT)}\nP_rect_02: {words(P_02)}\n",
+        "calib_cam_to_cam.txt": "corner_dist: 9.950000e-02\nS_rect_02: 1.242000e+03 3.750000e+02\n"
+        f"R_rect_00: {words(R_RECT)}\nP_rect_02: {words(P_02)}\n",
     }
     for name, text in calibration.items():
         (day / name).write_text("calib_time: 09-Jan-2012 13:57:47\n" + text)
@@ -302,7 +303,7 @@ def euroc(root: Path, count: int = 3) -> Miniature:
     """MH_01_easy, left camera alone: grey, 20 Hz; ground truth of the body at 200 Hz; lines end as on Windows."""
     folder = root / "MH_01_easy"
     cam = folder / "mav0" / "cam0"
-    images = [np.repeat(image[..., :1], 3, 2) for image in blobs(count)]
+    images = [np.repeat(image[..., :1], 3, 2) for image in enlarged(blobs(count, 47, 30), (752, 480))]
     stamps = [1403636579763555584 + 50_000_000 * i for i in range(count)]
     for stamp, image in zip(stamps, images, strict=True):
         write_image(cam / "data" / f"{stamp}.png", image[..., 0])
@@ -331,7 +332,8 @@ def euroc(root: Path, count: int = 3) -> Miniature:
 def replica(root: Path, count: int = 3) -> Miniature:
     """The scene room0; the camera's file stands beside the scenes."""
     folder = root / "Replica" / "room0"
-    images, units, poses = blobs(count, 60, 34), depth_units(count, 60, 34, seed=9), random_poses(count, seed=10)
+    size, poses = (1200, 680), random_poses(count, seed=10)
+    images, units = enlarged(blobs(count, 60, 34), size), enlarged(depth_units(count, 60, 34, seed=9), size)
     for i, (image, depth) in enumerate(zip(images, units, strict=True)):
         write_image(folder / "results" / f"frame{i:06d}.jpg", image)
         write_image(folder / "results" / f"depth{i:06d}.png", depth)

@@ -99,10 +99,15 @@ def test_the_camera_of_the_tum_benchmark_is_named_in_the_list(tmp_path: Path, ca
     assert source.kind == "tum" and source.calibration == ()
 
 
-def test_a_resized_tum_recording_has_no_lens(tmp_path: Path) -> None:
-    made = miniatures.tum_rgbd(tmp_path, size=(64, 48))
-    source = opened(made)
-    assert source.calibration == () and any("64x48, not 640x480" in n for n in source.notes)
+@pytest.mark.parametrize("kind", ["tum", "bonn", "kitti-raw", "euroc", "replica"])
+def test_pictures_that_were_resized_have_no_lens(tmp_path: Path, kind: str) -> None:
+    made = MAKERS[kind](tmp_path)
+    for path in (p for p in made.folder.rglob("*") if p.suffix in (".png", ".jpg")):
+        Image.open(path).resize((64, 48)).save(path)
+    source = open_source(made.folder, SourceConfig(kind=kind))
+    truth = source.truth()
+    assert source.calibration == () and truth is not None and truth.focal_px is None
+    assert any("the pictures are 64x48: it is not used" in n for n in source.notes)
 
 
 def test_truth_of_the_tum_benchmark_is_nearest_in_time(tmp_path: Path) -> None:
@@ -327,7 +332,7 @@ def test_a_picture_cut_short(tmp_path: Path, kind: str) -> None:
 def test_depth_of_another_size(tmp_path: Path) -> None:
     made = miniatures.replica(tmp_path)
     Image.fromarray(np.ones((10, 10), np.uint16)).save(made.folder / "results" / "depth000001.png")
-    with pytest.raises(InputError, match=r"depth000001\.png: expected 60x34 .* got 10x10"):
+    with pytest.raises(InputError, match=r"depth000001\.png: expected 1200x680 .* got 10x10"):
         list(opened(made).frames())
 
 

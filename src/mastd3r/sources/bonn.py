@@ -82,6 +82,7 @@ class BonnSource(TumSource):
             want_semantic=wants.semantic,
             semantic_dir=wants.semantic_dir,
             published=CALIBRATION,
+            lens_size=SIZE,
             found=found,
         )
         self._notes.put("truth", "groundtruth.txt is of the markers: moved to the camera by the published T_ros, T_m")

@@ -39,6 +39,7 @@ def find(folder: Path) -> Sequenced:
     frames = _frames(cam)
     sensor = _sensor(cam / "sensor.yaml")
     body_from_cam = rigid(_values(sensor, "T_BS", 16, cam / "sensor.yaml").reshape(4, 4), f"{cam / 'sensor.yaml'} T_BS")
+    resolution = _values(sensor, "resolution", 2, cam / "sensor.yaml")
     times, poses = np.empty(0), np.empty((0, 4, 4))
     notes = [f"no {TRUTH}/data.csv: no poses"]
     file = inner / TRUTH / "data.csv"
@@ -55,6 +56,7 @@ def find(folder: Path) -> Sequenced:
         times,
         poses,
         _lens(sensor, cam / "sensor.yaml"),
+        (int(resolution[0]), int(resolution[1])),
         notes=notes,
     )
 

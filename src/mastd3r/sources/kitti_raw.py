@@ -54,7 +54,7 @@ def find(folder: Path) -> Sequenced:
     if calibration is None:
         line = f"no calibration: {CALIBRATION[0]} is neither beside the drive nor in it; so neither poses nor lens"
         return Sequenced(KIND, folder.resolve().name, frames, found, notes=[line])
-    projection, cam_from_imu = _cam_from_imu(calibration, camera)
+    projection, cam_from_imu, size = _cam_from_imu(calibration, camera)
     poses, notes = np.empty((0, 4, 4)), ["no oxts/data: no poses"]
     if (folder / "oxts" / "data").is_dir():
         packets = numbered(folder / "oxts" / "data", "", ".txt", "packets")
@@ -69,6 +69,7 @@ def find(folder: Path) -> Sequenced:
         times if len(poses) else np.empty(0),
         poses,
         intrinsics_of(projection),
+        size,
         notes=notes,
     )
 
@@ -111,9 +112,9 @@ def _calibration_folder(folder: Path) -> Path | None:
     return next((p for p in (here.parent, here) if (p / CALIBRATION[0]).is_file()), None)
 
 
-def _cam_from_imu(folder: Path, camera: str) -> tuple[Array, Array]:
-    """The (3, 4) projection of a rectified camera, and (4, 4) from the IMU to that camera. Raises InputError."""
-    keys = {"R_rect_00": 9, f"P_rect_{camera}": 12}
+def _cam_from_imu(folder: Path, camera: str) -> tuple[Array, Array, tuple[int, int]]:
+    """The (3, 4) projection of a rectified camera, (4, 4) from the IMU to it, its size. Raises InputError."""
+    keys = {"R_rect_00": 9, f"P_rect_{camera}": 12, f"S_rect_{camera}": 2}
     cams = read_keyed(folder / CALIBRATION[0], keys)
     projection = cams[f"P_rect_{camera}"].reshape(3, 4)
     rectified = np.hstack([cams["R_rect_00"].reshape(3, 3), np.zeros((3, 1))])
@@ -122,4 +123,5 @@ def _cam_from_imu(folder: Path, camera: str) -> tuple[Array, Array]:
         found = read_keyed(folder / name, {"R": 9, "T": 3})
         step = np.hstack([found["R"].reshape(3, 3), found["T"].reshape(3, 1)])
         chain = chain @ rigid(step, str(folder / name))
-    return projection, chain
+    width, height = cams[f"S_rect_{camera}"]
+    return projection, chain, (int(width), int(height))

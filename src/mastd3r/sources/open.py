@@ -39,20 +39,16 @@ def _sequence(find: Callable[[Path], Sequenced]) -> Callable[[Path, SourceConfig
 
 def _tum(folder: Path, config: SourceConfig, wants: Wants, found: str) -> Source:
     recording = tum_rgbd.recording_of(folder) if (folder / "rgb.txt").is_file() else None
-    source = TumSource(
+    return TumSource(
         folder,
         config,
         want_depth=wants.depth,
         want_semantic=wants.semantic,
         semantic_dir=wants.semantic_dir,
         published=tum_rgbd.CAMERAS[recording[1]] if recording else (),
+        lens_size=tum_rgbd.SIZE,
         found=f"{found}; its head names {recording[0]}: camera {recording[1]}" if recording else found,
     )
-    if recording and source.size != tum_rgbd.SIZE:
-        source.calibration = ()  # these pictures were resized, nobody knows how
-        size = f"{source.size[0]}x{source.size[1]}"
-        source.notes.append(f"pictures are {size}, not 640x480: the camera's lens is not used")
-    return source
 
 
 def _images(folder: Path, config: SourceConfig, wants: Wants, found: str) -> Source:

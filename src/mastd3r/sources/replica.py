@@ -52,6 +52,7 @@ def find(folder: Path) -> Sequenced:
         times,
         poses,
         tuple(camera[k] for k in ("fx", "fy", "cx", "cy")),
+        (int(camera["w"]), int(camera["h"])),
         units_per_metre=camera["scale"],
         notes=[f"no times: {ASSUMED_FPS:g} frames a second assumed"],
     )

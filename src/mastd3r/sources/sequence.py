@@ -52,6 +52,7 @@ class Sequenced:
     truth_times_s: Array = field(default_factory=lambda: np.empty(0))  # (n,) float64
     world_from_cam: Array = field(default_factory=lambda: np.empty((0, 4, 4)))  # (n, 4, 4) float64
     calibration: tuple[float, ...] = ()  # fx fy cx cy and OpenCV's distortion, full-size pixels
+    lens_size: tuple[int, int] | None = None  # (width, height) that the calibration is of, where the dataset tells
     units_per_metre: float = 1000.0  # of integer depth files
     no_depth: int | None = None  # the value, beside 0, that means none
     notes: Sequence[str] = ()
@@ -63,7 +64,7 @@ class SequenceSource:
     def __init__(self, found: Sequenced, config: SourceConfig, wants: Wants) -> None:
         """Checks that the chosen files exist, reads the first for its size. Raises InputError, ConfigError."""
         self._found, self._wants = found, wants
-        self.kind, self.name, self.calibration = found.kind, found.name, found.calibration
+        self.kind, self.name = found.kind, found.name
         self._notes = Notes()
         self.notes: list[str] = self._notes
         self._notes.put("found", f"{found.kind}: {found.found}")
@@ -77,6 +78,7 @@ class SequenceSource:
         first = found.frames[self._chosen[0]].image
         height, width = read_rgb(first).shape[:2]
         self.size, self._first = (width, height), first
+        self.calibration = calibration_for(self.size, found.lens_size, found.calibration, self._notes)
         self.has_depth = any(found.frames[i].depth is not None for i in self._chosen)
         self._semantic: dict[int, Path] = {}
         if wants.semantic_dir is not None:
@@ -102,10 +104,21 @@ class SequenceSource:
     def truth(self) -> Truth | None:
         """Camera poses and focal length; None where the dataset has neither."""
         found = self._found
-        if len(found.truth_times_s) == 0 and not found.calibration:
+        if len(found.truth_times_s) == 0 and not self.calibration:
             return None
-        focal = found.calibration[0] if found.calibration else None
+        focal = self.calibration[0] if self.calibration else None
         return Truth(found.truth_times_s, found.world_from_cam, {}, focal)
+
+
+def calibration_for(
+    size: tuple[int, int], lens_size: tuple[int, int] | None, calibration: tuple[float, ...], notes: Notes
+) -> tuple[float, ...]:
+    """The calibration, or none with a note where pictures are not of its size: nobody knows how they were resized."""
+    if not calibration or lens_size in (None, size):
+        return calibration
+    of, there = (f"{s[0]}x{s[1]}" for s in (lens_size or size, size))
+    notes.put("lens", f"the dataset's lens is of {of} pixels, the pictures are {there}: it is not used")
+    return ()
 
 
 def check_times(times_s: Sequence[float], where: str) -> None:

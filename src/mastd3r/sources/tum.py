@@ -21,6 +21,7 @@ from .checks import check_same_size, window
 from .image_files import read_depth_m, read_probability, read_rgb
 from .notes import Notes
 from .semantic_maps import match_maps, nearest_time
+from .sequence import calibration_for
 
 Array = NDArray[Any]
 TUM_DEPTH_SCALE = 5000.0  # units of a 16-bit depth file a metre, where info.json does not tell
@@ -50,11 +51,13 @@ class TumSource:
         want_semantic: bool = True,
         semantic_dir: Path | None = None,
         published: tuple[float, ...] = (),
+        lens_size: tuple[int, int] | None = None,
         found: str = "",
     ) -> None:
         """Reads the lists, checks that the listed images exist. Raises InputError, ConfigError.
 
-        ``published`` is the calibration where info.json has none; ``found`` says what was found, for the notes.
+        ``published`` is the calibration where info.json has none, of pictures of ``lens_size``; ``found`` says what
+        was found, for the notes.
         """
         self.name = folder.resolve().name
         self._notes = Notes()
@@ -63,7 +66,6 @@ class TumSource:
             self._notes.put("found", f"{self.kind}: {found}")
         self._folder = folder
         self._info = _read_info(folder / "info.json")
-        self.calibration = self._intrinsics() or published
         self._rows = self._present(file_rows(folder / "rgb.txt"), folder / "rgb.txt")
         _check_ascending(self._rows, folder / "rgb.txt")
         self._chosen = window(config, len(self._rows), str(folder / "rgb.txt"))
@@ -75,6 +77,7 @@ class TumSource:
                 raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
         height, width = read_rgb(self._image(self._chosen[0])).shape[:2]
         self.size = (width, height)
+        self.calibration = self._intrinsics() or calibration_for(self.size, lens_size, published, self._notes)
         self._depth = self._associated("depth.txt")
         self._depth_scale = self._units_per_metre() if self._depth else TUM_DEPTH_SCALE
         if semantic_dir is not None:
