@@ -346,3 +346,16 @@ def test_an_interrupted_command_says_so_in_one_line(
     assert last.startswith("mastd3r: ") and "the same command again goes on from there" in last
     server.drop_always = None
     assert main(words) == 0 and "ready: " in capfd.readouterr().out
+
+
+def test_ctrl_c_says_that_the_download_goes_on(
+    server: FileServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    served(server, "tum", tmp_path / "made", monkeypatch)
+
+    def stopped(*args: Any, **options: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "fetch", stopped)
+    assert main(["download", "tum", "freiburg1_xyz", "--to", str(tmp_path / "to"), "--yes", "--quiet"]) == 130
+    assert "the same command goes on from there" in capfd.readouterr().err.splitlines()[-1]

@@ -1,7 +1,7 @@
 """The table of datasets: URLs, sizes, checksums, licences. Facts about the datasets, and nothing else.
 
-Sizes are bytes where a server or a published record tells them, and about what the dataset's page says otherwise;
-none where neither is known. Only the ETH Research Collection publishes checksums (EuRoC).
+Only the ETH Research Collection (EuRoC) publishes exact sizes and checksums, which a download is held to. The other
+sizes are for people: what the dataset's page says, or what its server has sent to others; none where neither is known.
 """
 
 from __future__ import annotations
@@ -19,8 +19,13 @@ _TUM = {
     "nostructure_notexture_near_withloop nostructure_texture_far nostructure_texture_near_withloop "
     "structure_notexture_far structure_notexture_near structure_texture_far structure_texture_near",
 }
-_TUM_BYTES = {"freiburg1_desk": 344_011_403, "freiburg3_long_office_household": 1_483_556_251}
-_TUM_ABOUT = {"freiburg1_xyz": 470 * _MB, "freiburg1_room": 830 * _MB, "freiburg2_desk": 2010 * _MB}
+_TUM_ABOUT = {
+    "freiburg1_desk": 344 * _MB,
+    "freiburg1_room": 830 * _MB,
+    "freiburg1_xyz": 470 * _MB,
+    "freiburg2_desk": 2010 * _MB,
+    "freiburg3_long_office_household": 1484 * _MB,
+}
 _BONN = (
     "balloon balloon2 balloon_tracking balloon_tracking2 crowd crowd2 crowd3 kidnapping_box kidnapping_box2 "
     "moving_nonobstructing_box moving_nonobstructing_box2 moving_obstructing_box moving_obstructing_box2 "
@@ -28,13 +33,11 @@ _BONN = (
     "placing_nonobstructing_box3 placing_obstructing_box removing_nonobstructing_box removing_nonobstructing_box2 "
     "removing_obstructing_box static static_close_far synchronous synchronous2"
 )
-_BONN_BYTES = {
-    "balloon": 243_818_512,
-    "person_tracking": 329_482_910,
-    "person_tracking2": 324_262_783,
-    "static_close_far": 1_034_619_467,
-}
 _BONN_ABOUT = {
+    "balloon": 244 * _MB,
+    "person_tracking": 329 * _MB,
+    "person_tracking2": 324 * _MB,
+    "static_close_far": 1035 * _MB,
     "crowd2": 498 * _MB,
     "balloon_tracking": 326 * _MB,
     "balloon_tracking2": 236 * _MB,
@@ -98,7 +101,6 @@ def _tum() -> Dataset:
     archives = {
         n: Archive(
             f"{n.partition('_')[0]}/rgbd_dataset_{n}.tgz",
-            size_bytes=_TUM_BYTES.get(n),
             about_bytes=_TUM_ABOUT.get(n),
         )
         for n in names
@@ -123,10 +125,7 @@ def _bonn() -> Dataset:
         "https://www.ipb.uni-bonn.de/html/projects/rgbd_dynamic2019",
         "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/",
         "not stated on its page; ask its authors before any use but research",
-        {
-            n: Archive(f"rgbd_bonn_{n}.zip", size_bytes=_BONN_BYTES.get(n), about_bytes=_BONN_ABOUT.get(n))
-            for n in names
-        },
+        {n: Archive(f"rgbd_bonn_{n}.zip", about_bytes=_BONN_ABOUT.get(n)) for n in names},
         {n: Sequence(n, f"rgbd_bonn_{n}", (Part(n),)) for n in names},
         prefix="rgbd_bonn_",
     )
