@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 KEPT = "what was computed so far is in the run folder"
-KEPT_BY = {c: "what has arrived is kept, the same command goes on from there" for c in ("download", "weights")}
+KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,7 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"mastd3r: {e}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print(f"mastd3r: stopped; {KEPT_BY.get(words[0] if words else '', KEPT)}", file=sys.stderr)
+        command = next((w for w in words if not w.startswith("-")), "")
+        print(f"mastd3r: stopped; {KEPT_BY.get(command, KEPT)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 0
