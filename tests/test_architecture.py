@@ -31,11 +31,14 @@ CONTRACTS = {"types", "config", "errors"}
 # What may be imported, from the bottom up. A module sees the entries named here, nothing else of the package.
 LAYERS: dict[str, set[str]] = {
     "errors": set(),
+    "fetch": {"errors"},
+    "archives": {"errors"},
+    "datasets": {"errors", "fetch", "archives"},
     "geometry": {"errors"},
     "types": {"geometry", "errors"},
     "config": {"errors"},
     **{stage: {"geometry", *CONTRACTS} for stage in STAGES},
-    "networks": {"geometry", *CONTRACTS},
+    "networks": {"geometry", "fetch", *CONTRACTS},
     "progress": set(),
     "rectify": {"geometry", "types", "errors"},
     "lens_view": {"geometry", "rectify"},
@@ -49,8 +52,9 @@ LAYERS: dict[str, set[str]] = {
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
     },
-    "cli_weights": {"errors", "networks", "progress"},
-    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights"},
+    "cli_weights": {"errors", "fetch", "networks", "progress"},
+    "cli_download": {"errors", "fetch", "datasets", "progress"},
+    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "cli_download"},
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
     "": set(),
@@ -69,7 +73,7 @@ HEAVY = {  # package: who may import it
     "gsplat": {"mapping"},
     "av": {"sources"},
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
-    "rich": {"progress", "cli_commands", "cli_weights"},
+    "rich": {"progress", "cli_commands", "cli_weights", "cli_download"},
 }
 NAMES_A_DEVICE = {"mapping.rasterise"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it

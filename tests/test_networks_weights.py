@@ -18,7 +18,7 @@ from rich.console import Console
 from local_server import FileServer, file_server
 from mastd3r import cli_weights
 from mastd3r.errors import ConfigError, InputError, SlamError
-from mastd3r.networks.fetch import Interrupted
+from mastd3r.fetch import Interrupted
 from mastd3r.networks.weights import absent, check, entries, folder_of, home, installed, path
 from mastd3r.networks.weights_download import download
 from mastd3r.networks.weights_known import DEFAULT_DINOV2, KNOWN, KnownFile, Licence

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Sequence
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+KEPT = "what was computed so far is in the run folder"
+KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -23,7 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"mastd3r: {e}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
-        print("mastd3r: stopped; what was computed so far is in the run folder", file=sys.stderr)
+        command = next((w for w in words if not w.startswith("-")), "")
+        print(f"mastd3r: stopped; {KEPT_BY.get(command, KEPT)}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 0

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, get_args
 
 import yaml
 from rich.console import Console
@@ -16,11 +16,12 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 from . import __version__
+from .cli_download import download_parser
 from .cli_weights import weights_parser
-from .config import Config, config_from_dict, config_from_yaml, config_to_yaml, with_override
+from .config import Config, SourceKind, config_from_dict, config_from_yaml, config_to_yaml, with_override
 from .errors import ConfigError
 
-INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, with OpenCV's distortion"
+INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
 
@@ -78,13 +79,14 @@ def _parser() -> argparse.ArgumentParser:
     view.add_argument("run", type=Path)
     view.set_defaults(act=_view)
     weights_parser(commands.add_parser("weights", help="list, download and check the weights of the networks"))
+    download_parser(commands.add_parser("download", help="list and bring the public datasets"))
     doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=_doctor)
     return parser
 
 
 def _run_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("source", type=Path, help="video, folder of images, or TUM-layout folder")
+    p.add_argument("source", type=Path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
     p.add_argument("--out", type=Path, required=True, help="run folder")
     p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
@@ -94,7 +96,8 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--correction", choices=("none", "coarse", "fine", "coarse-to-fine"))
     p.add_argument("--map-loss", choices=("plain", "mask", "uncertainty", "full"))
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
-    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]", help=INTRINSICS_HELP)
+    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
+    p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")
     p.add_argument("--start", type=int, help="first frame, from 0")
     p.add_argument("--end", type=int, help="one past the last frame")
     p.add_argument("--stride", type=int, help="every n-th frame")
@@ -111,7 +114,7 @@ def config_from_args(args: argparse.Namespace) -> Config:
     for name in ("pointmaps", "semantics", "correction", "seed"):
         if getattr(args, name) is not None:
             config = replace(config, **{name: getattr(args, name)})
-    window = {k: getattr(args, k) for k in ("start", "end", "stride") if getattr(args, k) is not None}
+    window = {k: getattr(args, k) for k in ("start", "end", "stride", "kind") if getattr(args, k) is not None}
     config = replace(config, source=replace(config.source, **window))
     if args.map_loss is not None:
         config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
@@ -119,8 +122,11 @@ def config_from_args(args: argparse.Namespace) -> Config:
         config = replace(config, mapping=replace(config.mapping, enabled=False))
     if args.maps is not None and config.semantics == "auto":
         config = replace(config, semantics="maps")
-    if args.intrinsics is not None:
-        config = replace(config, camera=replace(config.camera, intrinsics=_numbers(args.intrinsics)))
+    if args.intrinsics == "dataset":
+        config = replace(config, camera=replace(config.camera, intrinsics=(), from_dataset=True))
+    elif args.intrinsics is not None:
+        given = _numbers(args.intrinsics)
+        config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
     return config
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -13,10 +12,8 @@ from rich.table import Table
 from .errors import ConfigError, InputError
 
 if TYPE_CHECKING:
-    from .networks.fetch import Progress
     from .networks.weights_download import Accept
     from .networks.weights_known import Licence
-    from .progress import Bar, Reporter
 
 STATE_SHOWN = {"installed": "[green]installed[/green]", "incomplete": "[yellow]incomplete[/yellow]", "absent": "–"}
 
@@ -41,7 +38,7 @@ def weights_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _list(args: argparse.Namespace, console: Console) -> int:
-    from .networks.fetch import human_bytes
+    from .fetch import human_bytes
     from .networks.weights import entries, home
 
     table = Table("name", "here", "size", "licence", "what it is")
@@ -58,9 +55,9 @@ def _list(args: argparse.Namespace, console: Console) -> int:
 def _download(args: argparse.Namespace, console: Console) -> int:
     from .networks.weights_download import download
     from .networks.weights_known import KNOWN
-    from .progress import Silent, Terminal
+    from .progress import FileBars, Silent, Terminal
 
-    with _Bars(Silent() if args.quiet else Terminal(console)) as bars:
+    with FileBars(Silent() if args.quiet else Terminal(console)) as bars:
         got = download(args.what, _accept(args.yes, console), as_name=args.as_name, watch=bars.watch)
     if (got if got.is_dir() else got.parent).name not in KNOWN:
         console.print("The licence of these weights is not known here: see the page that they come from.")
@@ -82,39 +79,8 @@ def _accept(yes: bool, console: Console) -> Accept:
     return ask
 
 
-class _Bars:
-    """One bar a file, in units that people read, opened when the first bytes are there."""
-
-    def __init__(self, reporter: Reporter) -> None:
-        self._reporter, self._stack = reporter, ExitStack()
-        self._bar: Bar | None = None
-        self._unit, self._shown = 10**6, 0
-
-    def __enter__(self) -> _Bars:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._stack.close()
-
-    def watch(self, name: str) -> Progress:
-        """Where ``fetch`` tells how far the file of that name is."""
-        self._stack.close()
-        self._bar = None
-
-        def tell(done: int, total: int | None) -> None:
-            if self._bar is None:
-                self._unit, unit = (10**3, "kB") if total is not None and total < 10**7 else (10**6, "MB")
-                steps = -(-total // self._unit) if total is not None else None
-                self._bar, self._shown = self._stack.enter_context(self._reporter.stage(name, steps, unit)), 0
-            steps_done = -(-done // self._unit)
-            self._bar.advance(steps_done - self._shown)
-            self._shown = steps_done
-
-        return tell
-
-
 def _check(args: argparse.Namespace, console: Console) -> int:
-    from .networks.fetch import human_bytes
+    from .fetch import human_bytes
     from .networks.weights import check, entries
 
     names = [args.what] if args.what else [e.name for e in entries() if e.state == "installed"]

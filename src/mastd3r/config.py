@@ -19,6 +19,9 @@ PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
 SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
 CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
+SourceKind = Literal[
+    "auto", "video", "images", "tum", "bonn", "kitti-raw", "kitti-odometry", "7scenes", "euroc", "replica"
+]  # fmt: skip
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
 
 
@@ -29,6 +32,7 @@ class SourceConfig:
     start: int = 0  # first frame, counted from 0
     end: int | None = None  # one past the last frame; None = to the end
     stride: int = 1  # every n-th frame
+    kind: SourceKind = "auto"  # the layout; auto: found by looking at the files
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,7 @@ class CameraConfig:
     """The lens. Empty = found from the video itself."""
 
     intrinsics: tuple[float, ...] = ()  # fx fy cx cy [k1 [k2 p1 p2 [k3 [k4 k5 k6]]]], OpenCV, full-size pixels
+    from_dataset: bool = False  # True: the calibration that the dataset brings, in place of ``intrinsics``
     estimate_radial: bool = True  # find radial terms and principal point beside the focal length, where the video can
 
 

@@ -318,6 +318,7 @@ class RectifiedSource:
         self.name, self.kind, self.size, self.length = source.name, source.kind, rectifier.size, source.length
         self.notes = source.notes
         self.has_depth, self.has_semantic = source.has_depth, source.has_semantic
+        self.calibration: tuple[float, ...] = ()  # that of the photographs is not that of these
         self.truth = source.truth
 
     def frames(self) -> Iterator[Frame]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, config_to_yaml
-from .errors import InputError, SlamError
+from .errors import ConfigError, InputError, SlamError
 from .evaluation.evaluate import evaluate
 from .evaluation.image_error import psnr
 from .export.machine import peak_rss_mib
@@ -66,11 +66,13 @@ def run(
         want_semantic=want_semantic,
         semantic_dir=maps,
     )
+    config, told = _with_dataset_lens(config, source)
     rectifier = rectifier_for(config.camera.intrinsics, source.size)
     tracked = _tracked(source, rectifier)
     parts = build_parts(config, tracked)  # refuses before anything is written
     slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
     job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent())
+    job.folder.note(*told)
     try:
         job.everything()
     except SlamError as e:
@@ -80,6 +82,18 @@ def run(
         job.save_the_rest("stopped by the user (Ctrl-C)")
         raise
     return RunResult(job.folder.path, job.metrics)
+
+
+def _with_dataset_lens(config: Config, source: Source) -> tuple[Config, list[str]]:
+    """The dataset's calibration in place of intrinsics where it is asked for, and a note. Raises ConfigError."""
+    if not config.camera.from_dataset:
+        return config, []
+    given = source.calibration
+    if not given:
+        raise ConfigError(f"--intrinsics dataset: expected a calibration in {source.name} ({source.kind}), got none")
+    numbers = ",".join(f"{v:g}" for v in given)
+    lens = replace(config.camera, intrinsics=given)
+    return replace(config, camera=lens), [f"intrinsics: the calibration of the dataset ({source.kind}): {numbers}"]
 
 
 def _tracked(source: Source, rectifier: Rectifier | None) -> Source:

@@ -45,12 +45,13 @@ class Source(Protocol):
     """A re-iterable stream of frames: ``frames()`` may be called again and starts from the beginning."""
 
     name: str
-    kind: str  # "video", "images", "tum", "synthetic"
+    kind: str  # "video", "images", or the kind of a dataset's layout: config.SourceKind
     size: tuple[int, int]  # (width, height) of the first frame, upright
     length: int | None  # number of frames that frames() will give, None where unknown
     notes: list[str]  # choices and warnings, for the log and run.json
     has_depth: bool  # frames() can carry depth_m
     has_semantic: bool  # frames() can carry semantic
+    calibration: tuple[float, ...]  # what the dataset says of its lens, as --intrinsics; empty: nothing. See run.py
 
     def frames(self) -> Iterator[Frame]: ...
     def truth(self) -> Truth | None: ...

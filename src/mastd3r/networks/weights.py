@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import ConfigError, InputError, OutputError
-from .fetch import human_bytes, sha256_of
+from ..fetch import human_bytes, sha256_of
 from .weights_known import KNOWN, Known, Origin
 
 RECORD = "weights.json"

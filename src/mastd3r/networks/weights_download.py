@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ConfigError, InputError
-from .fetch import Progress, Unreachable, Wanted, fetch, local_path
+from ..fetch import Progress, Unreachable, Wanted, fetch, local_path
 from .weights import (
     NAMELESS,
     TENSORS,

@@ -31,15 +31,18 @@ def read_rgb(path: Path) -> Array:
     return np.array(image.convert("RGB"))  # a copy of its own, writable
 
 
-def read_depth_m(path: Path, units_per_metre: float) -> tuple[Array, int]:
+def read_depth_m(path: Path, units_per_metre: float, none: int | None = None) -> tuple[Array, int]:
     """A depth file as (h, w) float32 metres, 0 = none, and the number of values that were not finite.
 
-    Integer files hold metres times ``units_per_metre``; float files (.npy, 32-bit float images) hold metres.
+    Integer files hold metres times ``units_per_metre``, and ``none``, beside 0, where nothing was measured; float
+    files (.npy, 32-bit float images) hold metres.
     Values that are not finite, or negative, become 0. Raises InputError.
     """
     raw = _map_values(path, "a depth map")
     depth = raw.astype(np.float32)
     if raw.dtype.kind in "iu":
+        if none is not None:
+            depth[raw == none] = 0
         return np.maximum(depth / np.float32(units_per_metre), 0), 0
     finite = np.isfinite(depth)
     return np.where(finite & (depth > 0), depth, np.float32(0)), int(np.count_nonzero(~finite))

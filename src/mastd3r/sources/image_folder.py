@@ -36,6 +36,7 @@ class ImageFolderSource:
 
     kind = "images"
     has_depth = False
+    calibration: tuple[float, ...] = ()
 
     def __init__(
         self,

@@ -21,13 +21,16 @@ from .checks import check_same_size, window
 from .image_files import read_depth_m, read_probability, read_rgb
 from .notes import Notes
 from .semantic_maps import match_maps, nearest_time
+from .sequence import calibration_for
 
 Array = NDArray[Any]
 TUM_DEPTH_SCALE = 5000.0  # units of a 16-bit depth file a metre, where info.json does not tell
 
 
 @dataclass(frozen=True)
-class _Row:
+class Row:
+    """One line of a list."""
+
     line: int  # counted from 1, for messages
     timestamp_s: float
     words: tuple[str, ...]
@@ -37,6 +40,7 @@ class TumSource:
     """Colour, depth, semantic maps and truth of one TUM-layout folder, associated by time."""
 
     kind = "tum"
+    most_absent_ratio = 0.0  # of the listed files, that may be absent
 
     def __init__(
         self,
@@ -46,14 +50,23 @@ class TumSource:
         want_depth: bool = False,
         want_semantic: bool = True,
         semantic_dir: Path | None = None,
+        published: tuple[float, ...] = (),
+        lens_size: tuple[int, int] | None = None,
+        found: str = "",
     ) -> None:
-        """Reads the lists, checks that the listed images exist. Raises InputError, ConfigError."""
+        """Reads the lists, checks that the listed images exist. Raises InputError, ConfigError.
+
+        ``published`` is the calibration where info.json has none, of pictures of ``lens_size``; ``found`` says what
+        was found, for the notes.
+        """
         self.name = folder.resolve().name
         self._notes = Notes()
         self.notes: list[str] = self._notes
+        if found:
+            self._notes.put("found", f"{self.kind}: {found}")
         self._folder = folder
         self._info = _read_info(folder / "info.json")
-        self._rows = _file_rows(folder / "rgb.txt")
+        self._rows = self._present(file_rows(folder / "rgb.txt"), folder / "rgb.txt")
         _check_ascending(self._rows, folder / "rgb.txt")
         self._chosen = window(config, len(self._rows), str(folder / "rgb.txt"))
         self.length: int | None = len(self._chosen)
@@ -64,6 +77,7 @@ class TumSource:
                 raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
         height, width = read_rgb(self._image(self._chosen[0])).shape[:2]
         self.size = (width, height)
+        self.calibration = self._intrinsics() or calibration_for(self.size, lens_size, published, self._notes)
         self._depth = self._associated("depth.txt")
         self._depth_scale = self._units_per_metre() if self._depth else TUM_DEPTH_SCALE
         if semantic_dir is not None:
@@ -99,22 +113,37 @@ class TumSource:
         Masks are keyed by the timestamp of the frame that they belong to. None where the folder has none of
         the three.
         """
-        times, poses = _read_poses(self._folder / "groundtruth.txt")
+        times, poses = self._poses()
         moving = {float(self._times[i]): str(p) for i, p in self._associated("mask.txt").items()}
-        focal = self._number("fx")
+        focal = self._number("fx") or (self.calibration[0] if self.calibration else None)
         if len(times) == 0 and not moving and focal is None:
             return None
         return Truth(times, poses, moving, focal)
 
+    def _poses(self) -> tuple[Array, Array]:
+        return _read_poses(self._folder / "groundtruth.txt")
+
     def _image(self, i: int) -> Path:
         return self._folder / self._rows[i].words[0]
+
+    def _present(self, rows: list[Row], path: Path) -> list[Row]:
+        """The rows whose files are there, where some may be absent. Raises InputError where too many are."""
+        if not self.most_absent_ratio:
+            return rows
+        there = [row for row in rows if (self._folder / row.words[0]).is_file()]
+        absent = len(rows) - len(there)
+        if absent > self.most_absent_ratio * len(rows):
+            raise InputError(f"{path}: expected files beside its {len(rows)} lines, {absent} of them are not there")
+        if absent:
+            self._notes.put(f"absent {path.name}", f"{path.name}: {absent} of {len(rows)} files are absent, left out")
+        return there
 
     def _associated(self, list_name: str) -> dict[int, Path]:
         """Frame index -> file of a list such as depth.txt, by nearest time within 20 ms."""
         path = self._folder / list_name
         if not path.is_file():
             return {}
-        rows = sorted(_file_rows(path), key=lambda r: r.timestamp_s)
+        rows = sorted(self._present(file_rows(path), path), key=lambda r: r.timestamp_s)
         at = nearest_time(np.array([r.timestamp_s for r in rows]), self._times[list(self._chosen)])
         found = {i: self._folder / rows[k].words[0] for i, k in zip(self._chosen, at, strict=True) if k >= 0}
         self._notes.put(list_name, f"{list_name}: belongs to {len(found)} of {len(self._chosen)} frames")
@@ -126,6 +155,16 @@ class TumSource:
             self._notes.put("scale", f"info.json tells no depth_scale: {TUM_DEPTH_SCALE:g} units a metre assumed")
             return TUM_DEPTH_SCALE
         return scale
+
+    def _intrinsics(self) -> tuple[float, ...]:
+        """fx, fy, cx, cy and ``distortion`` (OpenCV's) of info.json; empty where it has not all four."""
+        four = [self._number(key) for key in ("fx", "fy", "cx", "cy")]
+        if any(v is None for v in four):
+            return ()
+        distortion = self._info.get("distortion", [])
+        if not isinstance(distortion, list) or not all(isinstance(v, int | float) for v in distortion):
+            raise InputError(f"{self._folder / 'info.json'}: expected distortion as a list, got {distortion!r}")
+        return (*(v for v in four if v is not None), *(float(v) for v in distortion))
 
     def _number(self, key: str) -> float | None:
         value = self._info.get(key)
@@ -148,13 +187,13 @@ def _read_info(path: Path) -> dict[str, Any]:
     return data
 
 
-def _rows_of(path: Path, words: int, what: str) -> list[_Row]:
+def _rows_of(path: Path, words: int, what: str) -> list[Row]:
     """Lines of a TUM list: a time, then ``words`` words (1: the rest of the line). Raises InputError."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
         raise InputError(f"{path}: expected a readable text file, got {e}") from e
-    rows: list[_Row] = []
+    rows: list[Row] = []
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
@@ -165,17 +204,18 @@ def _rows_of(path: Path, words: int, what: str) -> list[_Row]:
             time_s = np.nan
         if len(parts) < words + 1 or not np.isfinite(time_s):
             raise InputError(f"{path} line {number}: expected '{what}', got {line.strip()!r}")
-        rows.append(_Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
+        rows.append(Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
     if not rows:
         raise InputError(f"{path}: expected lines of '{what}', got none")
     return rows
 
 
-def _file_rows(path: Path) -> list[_Row]:
+def file_rows(path: Path) -> list[Row]:
+    """Lines 'timestamp_s filename' of a list. Raises InputError."""
     return _rows_of(path, 1, "timestamp_s filename")
 
 
-def _check_ascending(rows: list[_Row], path: Path) -> None:
+def _check_ascending(rows: list[Row], path: Path) -> None:
     for before, row in pairwise(rows):
         if row.timestamp_s <= before.timestamp_s:
             raise InputError(

@@ -81,6 +81,7 @@ class VideoSource:
 
     kind = "video"
     has_depth = False
+    calibration: tuple[float, ...] = ()
 
     def __init__(
         self,

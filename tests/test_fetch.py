@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from local_server import FileServer, file_server
+from mastd3r.archives import check_archive
 from mastd3r.errors import InputError, OutputError
-from mastd3r.networks.archives import check_archive
-from mastd3r.networks.fetch import (
+from mastd3r.fetch import (
     ANYTHING,
     Interrupted,
     Unreachable,
@@ -28,6 +28,7 @@ from mastd3r.networks.fetch import (
     fetch,
     human_bytes,
     local_path,
+    md5_of,
     sha256_of,
 )
 
@@ -68,6 +69,15 @@ def test_a_file_arrives_whole_with_its_checksum(server: FileServer, tmp_path: Pa
     assert got.path.read_bytes() == DATA and (got.size_bytes, got.sha256, got.resumed_bytes) == (SIZE, SHA, 0)
     assert names(got.path.parent) == ["w.bin"]
     assert told[0] == (0, SIZE) and told[-1] == (SIZE, SIZE) and told == sorted(told)
+
+
+def test_the_md5_of_a_server_is_held_to(server: FileServer, tmp_path: Path) -> None:
+    got = get(server, tmp_path / "right", Wanted(md5=hashlib.md5(DATA).hexdigest()))
+    assert got.path.read_bytes() == DATA and md5_of(got.path) == hashlib.md5(DATA).hexdigest()
+    wrong = hashlib.md5(OTHER).hexdigest()
+    with pytest.raises(InputError, match=rf"expected md5 {wrong}, got .*removed"):
+        get(server, tmp_path / "wrong", Wanted(md5=wrong))
+    assert names(tmp_path / "wrong") == []
 
 
 def test_connections_dropped_again_and_again_send_no_byte_twice(server: FileServer, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Getting one file, from the net or from the disk: resumed, checked, and there whole or not at all. Knows no weights.
+"""Getting one file, from the net or from the disk: resumed, checked, and there whole or not at all.
 
 A download grows in ``NAME.part``; ``NAME.part.json`` says which file of the server it is the beginning of (RFC 9110,
 sections 13 and 14: ETag, Last-Modified, Range, If-Range). A dropped connection, or a command that is run again, goes on
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from ..errors import InputError, OutputError
+from .errors import InputError, OutputError
 
 CHUNK_BYTES = 1 << 20
 AGENT = "mastd3r-slam"
@@ -61,6 +61,7 @@ class Wanted:
 
     sha256: str | None = None  # hexadecimal
     size_bytes: int | None = None
+    md5: str | None = None  # hexadecimal; for servers that publish no better one
     check: Callable[[Path], None] | None = None  # raises SlamError for a file whose content is no good
 
 
@@ -120,9 +121,18 @@ def local_path(source: str | Path) -> Path | None:
 
 def sha256_of(path: Path) -> str:
     """Hexadecimal SHA-256 of a file. Raises InputError."""
+    return _digest(path, "sha256")
+
+
+def md5_of(path: Path) -> str:
+    """Hexadecimal MD5 of a file: tells damage, not malice. Raises InputError."""
+    return _digest(path, "md5")
+
+
+def _digest(path: Path, kind: str) -> str:
     try:
         with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+            return hashlib.file_digest(file, kind).hexdigest()
     except OSError as e:
         raise InputError(f"{path}: expected a readable file, got {e.strerror or e}") from e
 
@@ -342,6 +352,9 @@ def _finish(source: str, part: Path, target: Path, want: Wanted, resumed: int) -
             raise InputError(f"{source}: expected {want.size_bytes} bytes, got {size}; what had arrived was removed")
         if want.sha256 not in (None, found):
             text = f"{source}: expected sha256 {want.sha256}, got {found}"
+            raise InputError(f"{text}; damaged or another file, what had arrived was removed")
+        if want.md5 is not None and (md5 := md5_of(part)) != want.md5:
+            text = f"{source}: expected md5 {want.md5}, got {md5}"
             raise InputError(f"{text}; damaged or another file, what had arrived was removed")
         if want.check is not None:
             want.check(part)

@@ -1,0 +1,123 @@
+"""EuRoC MAV, left camera alone: a folder that holds mav0 (or mav0 itself), in the ASL layout.
+
+Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016. cam0/data.csv: nanoseconds and file names;
+cam0/sensor.yaml: T_BS from camera to body, row by row, and intrinsics fu fv cu cv with radial-tangential distortion,
+which is OpenCV's k1 k2 p1 p2; state_groundtruth_estimate0/data.csv: nanoseconds, position of the body, quaternion wxyz.
+world_from_cam = world_from_body T_BS, at the 200 Hz of the ground truth; each frame's is the nearest within 20 ms.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..errors import InputError
+from .sequence import Listed, Sequenced, check_times, read_lines, read_numbers, rigid
+
+Array = NDArray[Any]
+KIND = "euroc"
+EXPECTED = "EuRoC (mav0/cam0/data.csv, mav0/cam0/data/*.png)"
+LENS_KEYS = {"camera_model": "pinhole", "distortion_model": "radial-tangential"}
+TRUTH = "state_groundtruth_estimate0"
+
+
+def looks_like(folder: Path) -> str | None:
+    """What makes a folder a sequence of EuRoC, or None."""
+    inner = _inner(folder)
+    return f"{inner.name}/cam0/data.csv is there" if (inner / "cam0" / "data.csv").is_file() else None
+
+
+def find(folder: Path) -> Sequenced:
+    """Frames of cam0, their times, poses and lens. Raises InputError."""
+    inner = _inner(folder)
+    cam = inner / "cam0"
+    frames = _frames(cam)
+    sensor = _sensor(cam / "sensor.yaml")
+    body_from_cam = rigid(_values(sensor, "T_BS", 16, cam / "sensor.yaml").reshape(4, 4), f"{cam / 'sensor.yaml'} T_BS")
+    resolution = _values(sensor, "resolution", 2, cam / "sensor.yaml")
+    times, poses = np.empty(0), np.empty((0, 4, 4))
+    notes = [f"no {TRUTH}/data.csv: no poses"]
+    file = inner / TRUTH / "data.csv"
+    if file.is_file():
+        times, world_from_body = _body_poses(file)
+        poses = world_from_body @ body_from_cam
+        notes = [f"{len(poses)} poses of {TRUTH}, moved from the body to cam0 by T_BS"]
+    here = folder.resolve()
+    return Sequenced(
+        KIND,
+        here.parent.name if here.name == "mav0" else here.name,
+        frames,
+        "cam0, grey; lens of cam0/sensor.yaml",
+        times,
+        poses,
+        _lens(sensor, cam / "sensor.yaml"),
+        (int(resolution[0]), int(resolution[1])),
+        notes=notes,
+    )
+
+
+def _inner(folder: Path) -> Path:
+    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+
+
+def _frames(cam: Path) -> list[Listed]:
+    frames = []
+    for number, line in read_lines(cam / "data.csv"):
+        stamp, _, name = (part.strip() for part in line.partition(","))
+        if not stamp.isdecimal() or not name:
+            raise InputError(f"{cam / 'data.csv'} line {number}: expected 'nanoseconds,filename', got {line[:60]!r}")
+        frames.append(Listed(int(stamp) / 1e9, cam / "data" / name))
+    if not frames:
+        raise InputError(f"{cam / 'data.csv'}: expected lines of 'nanoseconds,filename', got none")
+    return frames
+
+
+def _body_poses(path: Path) -> tuple[Array, Array]:
+    """Times (n,) and world_from_body (n, 4, 4)."""
+    rows = read_numbers(path, 8, "nanoseconds, position, quaternion wxyz, ...", ",", at_least=True)
+    stamps = [int(line.partition(",")[0]) for _, line in read_lines(path)]  # exact, as the images' are
+    times = np.array(stamps) / 1e9
+    check_times(list(times), str(path))
+    if not np.allclose(np.linalg.norm(rows[:, 4:8], axis=1), 1, atol=1e-2):
+        raise InputError(f"{path}: expected unit quaternions in columns 5 to 8, got others")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = rows[:, 1:4]
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, [5, 6, 7, 4]]).as_matrix()
+    return times, poses
+
+
+def _sensor(path: Path) -> dict[str, Any]:
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as e:
+        raise InputError(f"{path}: expected the camera's calibration, got no such file") from e
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
+        raise InputError(f"{path}: expected readable YAML, got {' '.join(str(e).split())}") from e
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: expected key: value pairs, got {type(data).__name__}")
+    return data
+
+
+def _values(sensor: dict[str, Any], key: str, count: int, path: Path) -> Array:
+    value = sensor.get(key)
+    numbers = value.get("data") if isinstance(value, dict) else value
+    try:
+        array = np.array(numbers, float).ravel()
+    except (TypeError, ValueError):
+        array = np.empty(0)
+    if len(array) != count or not np.isfinite(array).all():
+        raise InputError(f"{path}: expected {key} of {count} numbers, got {numbers!r}")
+    return array
+
+
+def _lens(sensor: dict[str, Any], path: Path) -> tuple[float, ...]:
+    for key, expected in LENS_KEYS.items():
+        if sensor.get(key) != expected:
+            raise InputError(f"{path}: expected {key} {expected}, got {sensor.get(key)!r}")
+    intrinsics = _values(sensor, "intrinsics", 4, path)
+    return (*map(float, intrinsics), *map(float, _values(sensor, "distortion_coefficients", 4, path)))

@@ -1,0 +1,74 @@
+"""Replica as rendered for iMAP and published with NICE-SLAM: results/frameNNNNNN.jpg, depthNNNNNN.png, traj.txt.
+
+Straub et al., "The Replica dataset", 2019; Zhu et al., "NICE-SLAM", CVPR 2022. A line of traj.txt is the (4, 4) matrix
+from camera to world, 16 numbers row by row, OpenCV axes (NICE-SLAM's loader turns y and z over because its own cameras
+look backwards). cam_params.json, in the scene's folder or beside it: w h fx fy cx cy and scale, the units of a depth
+file a metre (6553.5). No times: 30 frames a second assumed.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import InputError
+from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid_all, without_gaps
+
+KIND = "replica"
+EXPECTED = "Replica (results/frame000000.jpg, results/depth000000.png ..., traj.txt; cam_params.json beside the scene)"
+KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+
+
+def looks_like(folder: Path) -> str | None:
+    """What makes a folder a scene of Replica, or None."""
+    if not (folder / "results").is_dir():
+        return None
+    first = next((folder / "results").glob("frame*.jpg"), None)
+    return f"results/{first.name} and its like are there" if first is not None else None
+
+
+def find(folder: Path) -> Sequenced:
+    """Frames with depth, poses and lens. Raises InputError."""
+    poses = rigid_all(read_numbers(folder / "traj.txt", 16, "a (4, 4) matrix"), folder / "traj.txt")
+    results = folder / "results"
+    found = numbered(results, "frame", ".jpg", "images")
+    if len(found) > len(poses):
+        raise InputError(f"{folder / 'traj.txt'}: expected {len(found)} poses, one an image, got {len(poses)}")
+    images = without_gaps(found, len(poses), "images", results)
+    depths = [results / image.name.replace("frame", "depth", 1).replace(".jpg", ".png") for image in images]
+    times = np.arange(len(poses)) / ASSUMED_FPS
+    file, camera = _camera(folder)
+    frames = [
+        Listed(float(t), image, depth if depth.is_file() else None)
+        for t, image, depth in zip(times, images, depths, strict=True)
+    ]
+    return Sequenced(
+        KIND,
+        folder.resolve().name,
+        frames,
+        f"{len(frames)} frames, {sum(f.depth is not None for f in frames)} with depth; lens of {file.name}",
+        times,
+        poses,
+        tuple(camera[k] for k in ("fx", "fy", "cx", "cy")),
+        (int(camera["w"]), int(camera["h"])),
+        units_per_metre=camera["scale"],
+        notes=[f"no times: {ASSUMED_FPS:g} frames a second assumed"],
+    )
+
+
+def _camera(folder: Path) -> tuple[Path, dict[str, float]]:
+    """cam_params.json of the scene or of all scenes."""
+    here = folder.resolve()
+    file = next((p for p in (here / "cam_params.json", here.parent / "cam_params.json") if p.is_file()), None)
+    if file is None:
+        raise InputError(f"{folder}: expected cam_params.json in the folder or beside it, got none")
+    try:
+        camera = json.loads(file.read_text(encoding="utf-8"))["camera"]
+        numbers = {k: float(camera[k]) for k in KEYS}
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise InputError(f"{file}: expected 'camera' with {', '.join(KEYS)}, got {type(e).__name__} {e}") from e
+    if not all(np.isfinite(v) for v in numbers.values()) or min(numbers[k] for k in ("fx", "fy", "scale")) <= 0:
+        raise InputError(f"{file}: expected fx, fy and scale above 0, got {camera}")
+    return file, numbers
