@@ -197,10 +197,7 @@ def random_mast3r(config: Mast3rConfig, seed: int = 0) -> Mast3r:
 
 
 def seeded_weights(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, Array]:
-    """Random float32 arrays that depend on a name, its shape and the seed only; doubled names get equal values.
-
-    Weights have variance 1 / fan-in, so that signals keep their size through the layers; scales of norms are near 1.
-    """
+    """Random float32 arrays that depend on a name, its shape and the seed only; doubled names get equal values."""
     made: dict[str, Array] = {}
     for name, shape in sorted(shapes.items()):
         source = name
@@ -209,17 +206,23 @@ def seeded_weights(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, A
         if source in made:
             made[name] = made[source]
             continue
+        mean, deviation = weight_law(source, shape)
         values = np.random.RandomState(zlib.crc32(source.encode()) ^ seed).standard_normal(shape).astype(np.float32)
-        if len(shape) > 1:
-            transposed = ".act_postprocess.0.1." in source or ".act_postprocess.1.1." in source
-            fan_in = shape[0] if transposed else int(np.prod(shape[1:]))
-            last = source.endswith(".dpt.head.4.weight")  # its outputs stand in an exponent
-            values *= fan_in**-0.5 * (0.2 if last else 1)
-        elif "norm" in source.split(".")[-2] and source.endswith(".weight"):
-            values = 1 + 0.1 * values
-        else:
-            values *= 0.1
-            if source.endswith(".dpt.head.4.bias"):
-                values[2] += 2.5  # points lie before the camera, not around its centre
-        made[name] = values.astype(np.float32)
+        made[name] = (mean + np.float32(deviation) * values).astype(np.float32)
     return made
+
+
+def weight_law(name: str, shape: tuple[int, ...]) -> tuple[Array, float]:
+    """Mean, to be broadcast, and deviation of a parameter's random values.
+
+    Weights have variance 1 / fan-in, so that signals keep their size through the layers; scales of norms are near 1.
+    """
+    if len(shape) > 1:
+        transposed = ".act_postprocess.0.1." in name or ".act_postprocess.1.1." in name
+        fan_in = shape[0] if transposed else int(np.prod(shape[1:]))
+        last = name.endswith(".dpt.head.4.weight")  # its outputs stand in an exponent
+        return np.zeros(1, np.float32), fan_in**-0.5 * (0.2 if last else 1)
+    if "norm" in name.split(".")[-2] and name.endswith(".weight"):
+        return np.ones(1, np.float32), 0.1
+    before = name.endswith(".dpt.head.4.bias")  # points lie before the camera, not around its centre
+    return np.array([0, 0, 2.5, 0] if before else [0], np.float32), 0.1

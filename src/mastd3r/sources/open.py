@@ -9,7 +9,6 @@ from ..errors import InputError
 from ..types import Source
 from .image_folder import ImageFolderSource, image_files
 from .tum import TumSource
-from .video import VideoSource
 
 
 def open_source(
@@ -30,6 +29,8 @@ def open_source(
     if not path.exists():
         raise InputError(f"{path}: expected a video or a folder of images, got no such path")
     if path.is_file():
+        from .video import VideoSource  # brings PyAV, which folders do not need
+
         return VideoSource(path, config, want_semantic=want_semantic, semantic_dir=semantic_dir)
     if not path.is_dir():
         raise InputError(f"{path}: expected a file or a folder, got something else")
