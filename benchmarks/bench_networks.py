@@ -1,7 +1,7 @@
 """Speed, memory and precision of the networks and of the loop around them; random weights, no download; writes JSON.
 
     PYTHONPATH=src python benchmarks/bench_networks.py --out networks.json --sequence FOLDER [--reference DIR]
-        [--parts precision matching dinov2 reference loop graphed compiled] [--seconds 280] [--small]
+        [--parts precision graphed reference matching dinov2 loop compiled] [--seconds 280] [--small]
 
 FOLDER is a TUM-layout folder with depth and poses (for the loop and the matching), DIR a checkout of the public MASt3R
 with its submodules, as for benchmarks/compare_reference.py. Weights are drawn on the device from a seed, at the size of
@@ -36,12 +36,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 
 import numpy as np
 import torch
-from torch import nn
 
+from mastd3r.errors import SlamError
 from mastd3r.networks.mast3r import Encoded, Mast3r, Mast3rConfig, weight_law
 from mastd3r.networks.pair import PairNetwork
 
-PARTS = ("precision", "matching", "dinov2", "reference", "loop", "graphed", "compiled")
+PARTS = ("precision", "graphed", "reference", "matching", "dinov2", "loop", "compiled")
 SETTINGS = {  # name: (precision of ours, TF32 products allowed)
     "float32": ("float32", False),
     "float32, TF32": ("float32", True),
@@ -49,6 +49,8 @@ SETTINGS = {  # name: (precision of ours, TF32 products allowed)
     "bfloat16": ("bfloat16", True),
 }
 SIZE = (512, 384)
+FAILURES = (RuntimeError, ValueError, TypeError, LookupError, AttributeError, AssertionError, ArithmeticError, OSError,
+            ImportError, SlamError)  # fmt: skip
 
 
 class Bench:
@@ -62,6 +64,7 @@ class Bench:
         self.size = (160, 112) if self.small else SIZE
         self.repeats = 2 if self.small else 20
         self.auto = "float32" if self.device.type == "cpu" else "bfloat16"  # as the package chooses
+        self.execution = "eager"  # of the loop: "graph", as the package chooses on CUDA, once the part of it went well
         self._master: Mast3r | None = None
         self.result: dict[str, Any] = {"parts": {}, "failed": {}, "left_out": {}}
 
@@ -71,12 +74,12 @@ class Bench:
             self._master = random_on(self.device, self.config)
         return self._master
 
-    def network(self, setting: str, *, compile: bool = False) -> PairNetwork:
+    def network(self, setting: str, execution: str = "eager") -> PairNetwork:
         """Ours, in a setting of its own; TF32 is set for everything that follows."""
         precision, tf32 = SETTINGS[setting]
         allow_tf32(tf32)
         long_side = max(self.size)
-        return PairNetwork(deepcopy(self.master()), str(self.device), precision, compile, long_side_px=long_side)
+        return PairNetwork(deepcopy(self.master()), str(self.device), precision, execution, long_side)
 
     def left_s(self) -> float:
         return float(self.options.seconds - (time.perf_counter() - self.began))
@@ -143,12 +146,12 @@ def allow_tf32(yes: bool) -> None:
     torch.backends.cudnn.allow_tf32 = yes
 
 
-def alone(model: nn.Module, images: list[torch.Tensor]) -> Callable[[], Any]:
+def alone(network: PairNetwork, images: list[torch.Tensor]) -> Callable[[], Any]:
     """One frame of the network alone: encode it, decode it with one that is encoded."""
-    keyframe: Encoded = model.encode(images[0])
+    keyframe: Encoded = network.encode_images(images[0])
 
     def call() -> Any:
-        return model.decode(model.encode(images[1]), keyframe)
+        return network.decode_views(network.encode_images(images[1]), keyframe)
 
     return call
 
@@ -158,8 +161,8 @@ def precision(b: Bench) -> dict[str, Any]:
     """Frames/s, memory and distance from float32 of every precision."""
     images, found, exact = b.images(), {}, None
     for setting in SETTINGS:
-        model = b.network(setting).model
-        call = alone(model, images)
+        network = b.network(setting)
+        model, call = network.model, alone(network, images)
         found[setting] = b.timed(call)
         found[setting]["encode_ms"] = b.timed(lambda m=model: m.encode(images[1]))["ms_in_a_row"]
         keyframe = model.encode(images[0])
@@ -169,7 +172,7 @@ def precision(b: Bench) -> dict[str, Any]:
         outputs = call()
         exact = exact or outputs
         found[setting]["relative_error"] = errors(outputs, exact)
-        del model, call, keyframe, many
+        del network, model, call, keyframe, many
     return found
 
 
@@ -190,28 +193,23 @@ def errors(ours: Any, theirs: Any) -> dict[str, list[float]]:
 
 @torch.inference_mode()
 def graphed(b: Bench) -> dict[str, Any]:
-    """The network alone as one recorded CUDA graph: what is left when nothing waits for launches."""
+    """The network alone, recorded: what is left when nothing waits for launches. What ``auto`` takes on CUDA."""
     if b.device.type != "cuda":
         return {"left_out": "no CUDA device"}
-    images = b.images()
-    call = alone(b.network(b.auto).model, images)
-    side = torch.cuda.Stream()
-    side.wait_stream(torch.cuda.current_stream())
-    with torch.cuda.stream(side):
-        for _ in range(3):
-            call()
-    torch.cuda.current_stream().wait_stream(side)
-    graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
-        call()
-    return {b.auto: b.timed(graph.replay)}
+    images, found = b.images(), {}
+    exact = alone(b.network("float32"), images)()
+    for setting in SETTINGS:
+        call = alone(b.network(setting, "graph"), images)
+        found[setting] = {**b.timed(call), "relative_error": errors(call(), exact)}
+    b.execution = "graph"
+    return found
 
 
 def compiled(b: Bench) -> dict[str, Any]:
     """torch.compile in a process of its own, which is ended when the time is up."""
     if b.options.compile_here:
         with torch.inference_mode():
-            model = b.network(b.auto, compile=True).model
+            model = b.network(b.auto, "compile")
             start = time.perf_counter()
             images = b.images()
             call = alone(model, images)
@@ -284,7 +282,7 @@ def _evidence(b: Bench, name: str) -> Any:
     start = time.perf_counter()
     try:
         yield
-    except Exception as e:  # noqa: BLE001 - whatever happened, the other parts are still to be measured
+    except FAILURES as e:  # whatever happened, the other parts are still to be measured
         b.result["failed"][name] = f"{type(e).__name__}: {' '.join(str(e).split())[:300]}"
         traceback.print_exc()
     b.result.setdefault("part_s", {})[name] = round(time.perf_counter() - start, 1)

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def dinov2(b: Any) -> dict[str, Any]:
     images = b.images()
     rng = np.random.default_rng(0)
     photograph = rng.integers(0, 255, (b.size[1], b.size[0], 3), np.uint8)
-    call = bench.alone(b.network(b.auto).model, images)
+    call = bench.alone(b.network(b.auto, b.execution), images)
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         _random_dinov2(Path(folder), b.small)
@@ -130,14 +131,14 @@ def loop(b: Any) -> dict[str, Any]:
     clip = _clip(b)
     if clip is None:
         return {"left_out": "no --sequence"}
-    network = b.network(b.auto)
+    network = b.network(b.auto, b.execution)
     with torch.inference_mode():
         images = [torch.from_numpy(network.prepare(f.image).image[None]).to(b.device) for f in clip.frames[:2]]
-        network_alone = b.timed(bench.alone(network.model, images))
+        network_alone = b.timed(bench.alone(network, images))
     truth = TruthNetwork(network, clip)
     _tracked(b, truth, min(WARM_FRAMES, len(clip.frames)))
     b.reset_peak()
-    found = {"network_alone": network_alone, "loop": _tracked(b, truth, len(clip.frames))}
+    found = {"execution": b.execution, "network_alone": network_alone, "loop": _tracked(b, truth, len(clip.frames))}
     truth.run_layers = False
     found["loop_without_decoders"] = _tracked(b, truth, len(clip.frames))
     found["loop_over_network"] = round(found["loop"]["per_s"] / network_alone["per_s"], 4)
@@ -149,18 +150,17 @@ def _tracked(b: Any, truth: TruthNetwork, frames: int) -> dict[str, Any]:
     clip, config = truth.clip, Config()
     width, height = working_size_of(truth, clip.size)
     matcher = _matched_on(b.device)
-    provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher)
+    most = 4 if b.device.type == "cpu" else 24
+    provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
     places = PlaceIndex(provider.place_descriptor)
-    parts = Parts(provider, (width, height), places=places, own_scale_known=False)
+    parts = Parts(provider, (width, height), places=places, own_scale_known=False, pairs_ahead=b.device.type != "cpu")
     slam = Slam(config, parts, clip.size)
     truth.encoded = truth.decoded = 0
     stages: dict[str, list[float]] = defaultdict(list)
     reports = []
-    with _watched(stages, truth, provider, slam):
+    with _watched(stages, truth, parts, slam):
         start = time.perf_counter()
-        for n, frame in enumerate(clip.photographs()):
-            if n == frames:
-                break
+        for frame in parts.frames_ahead(islice(clip.photographs(), frames), slam.near):
             reports.append(slam.step(frame))
         b.wait()
         seconds = time.perf_counter() - start
@@ -176,13 +176,16 @@ def _tracked(b: Any, truth: TruthNetwork, frames: int) -> dict[str, Any]:
 
 
 @contextmanager
-def _watched(stages: dict[str, list[float]], truth: TruthNetwork, provider: Any, slam: Slam) -> Iterator[None]:
+def _watched(stages: dict[str, list[float]], truth: TruthNetwork, parts: Parts, slam: Slam) -> Iterator[None]:
     """Time of the stages, host side, each with what it calls; a stage that waits for the device has its time too."""
     import mastd3r.compare as compare_module
 
+    provider = parts.provider
     watched: list[tuple[Any, str, str]] = [
-        (truth, "prepare", "network: prepare"), (truth, "encode", "network: encode"), (truth, "pair", "network: pair"),
-        (provider, "matcher", "pair: match pixels"), (provider, "observe", "observe"),
+        (truth, "prepare", "network: prepare"), (truth, "encode", "network: encode"),
+        (truth, "pairs", "network: pairs"),
+        (provider, "matcher", "pair: match pixels"), (parts, "observe", "observe (waits for what is looked at ahead)"),
+        (provider, "look", "ahead: look, encode"), (provider, "beside", "ahead: decode, own depth"),
         (provider, "predict", "pair: predict"), (slam.belief, "prior", "mask: prior"),
         (slam, "_update_belief", "mask: update"), (slam.comparer, "compare", "compare (predict, align)"),
         (compare_module, "align", "pair: align"), (slam, "_add_keyframe", "keyframe: add"),

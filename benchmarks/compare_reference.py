@@ -253,7 +253,7 @@ def main() -> None:
         config = Mast3rConfig.released()
         net = reference_network(options.reference, config).to(options.device)
         model = own_network(net, config)
-        PairNetwork(model, options.device, options.own_precision, options.compile)
+        PairNetwork(model, options.device, options.own_precision, "compile" if options.compile else "eager")
         sizes = [tuple(int(v) for v in size.split("x")) for size in options.sizes]
         result = {
             "torch": torch.__version__, "machine": platform.processor() or platform.machine(),

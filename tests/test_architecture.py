@@ -37,10 +37,11 @@ LAYERS: dict[str, set[str]] = {
     **{stage: {"geometry", *CONTRACTS} for stage in STAGES},
     "networks": {"geometry", *CONTRACTS},
     "progress": set(),
+    "lookahead": set(),
     "rectify": {"geometry", "types", "errors"},
     "lens_view": {"geometry", "rectify"},
     "view_depth": {"geometry", "types", *STAGES},
-    "parts": {*CONTRACTS, *STAGES, "networks"},
+    "parts": {*CONTRACTS, *STAGES, "networks", "lookahead"},
     "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
@@ -70,7 +71,7 @@ HEAVY = {  # package: who may import it
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights"},
 }
-NAMES_A_DEVICE = {"mapping.rasterise"}
+NAMES_A_DEVICE = {"mapping.rasterise", "networks.record"}  # the latter: recordings are CUDA's
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
 EXITS = {"cli", "__main__"}

@@ -69,6 +69,9 @@ class KnowsTheClip:
             self.views[seen.index] = view_of(camera, camera_pose(time_s), depth)
         return self.views[seen.index]
 
+    def pairs(self, pairs: Any) -> list[Any]:
+        return [self.pair(a, b) for a, b in pairs]
+
     def pair(self, a: Seen, b: Seen) -> Both:
         self.decoded += 1
         first, second = decoded(self.view(a), self.view(b), 0.1)

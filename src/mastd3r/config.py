@@ -20,6 +20,7 @@ SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
 CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
+ExecutionKind = Literal["auto", "eager", "graph", "compile"]
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,8 @@ class NetworksConfig:
     mast3r: str = "mast3r"  # a file
     dinov2: str = "dinov2-with-registers-small"  # a folder
     precision: PrecisionKind = "auto"  # of the matrix products; auto: bfloat16 on an accelerator, float32 on the CPU
+    execution: ExecutionKind = "auto"  # of MASt3R; eager: layer by layer; graph: recorded once a size, CUDA only;
+    # compile: torch.compile, minutes at the first frame; auto: graph on an accelerator, eager on the CPU
     long_side_px: int = 512  # of the image that MASt3R sees, a multiple of 16; it was trained at 512
 
 

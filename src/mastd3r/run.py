@@ -141,7 +141,7 @@ class _Job:
     def _track(self) -> int:
         count = 0
         with self.reporter.stage("tracking", self.source.length, "frames") as bar:
-            for frame in self.tracked.frames():
+            for frame in self.slam.parts.frames_ahead(self.tracked.frames(), self.slam.near):
                 self.slam.step(frame)
                 count += 1
                 bar.advance()

@@ -18,7 +18,7 @@ from .graph.bundle import Lens
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
 from .graph.places import covisible, nearest_keyframe
 from .graph.submaps import join, scale_between
-from .parts import Parts
+from .parts import Near, Parts
 from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
 from .types import Frame, Guess, State, WorkFrame
@@ -78,6 +78,11 @@ class Slam:
         self._last: tuple[WorkFrame, Array] | None = None  # last tracked frame and its P(moving)
         self._cam_from_ref = np.eye(4)  # of the last tracked frame
         self._most_matched = 0  # by any frame since ref was chosen
+
+    def near(self) -> Near:
+        """What the frame after the next is probably seen beside: the keyframe that is followed now."""
+        ref = self._ref
+        return lambda _: None if ref is None else ref.work
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
@@ -242,6 +247,7 @@ class Slam:
         self._chain[before.id, kf.id] = view.pair.flow
         self._connect(kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
         recent = [k for k in graph.members()[-2 - self.config.graph.neighbours : -1] if k != before.id]
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before.id, *reversed(recent))])
         for k in reversed(recent):
             self._connect_both(k, kf.id)
         self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
@@ -256,7 +262,9 @@ class Slam:
     def _extend(self, kf: Keyframe, recent_from: int) -> None:
         """Older keyframes that see the same place, the window, and now and then everything."""
         graph, c = self.graph, self.config.graph
-        for k in covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio):
+        older = covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio)
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
+        for k in older:
             self._connect_both(k, kf.id)
         graph.solve_window()
         joined = len(graph.started) > 1 and self._joins(kf)

@@ -9,7 +9,7 @@ positions are those of the grid as it is.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,16 +132,6 @@ class Mast3r(nn.Module):
         maps1, maps2 = self.decode_tokens(first.tokens, second.tokens, *ropes)
         return self.downstream_head1(maps1, *first.grid), self.downstream_head2(maps2, *second.grid)
 
-    def decode_symmetric(
-        self, a: Encoded, b: Encoded
-    ) -> tuple[tuple[HeadOutput, HeadOutput], tuple[HeadOutput, HeadOutput]]:
-        """((a, b in a's camera), (b, a in b's camera)): both orders, as one batch where the grids are equal."""
-        if a.grid != b.grid:
-            return self.decode(a, b), self.decode(b, a)
-        first, second = self.decode(stacked([a, b]), stacked([b, a]))
-        n = len(a)
-        return (_rows(first, 0, n), _rows(second, 0, n)), (_rows(first, n, 2 * n), _rows(second, n, 2 * n))
-
     def encode_tokens(self, images: Tensor, rope: RopeTable) -> Tensor:
         """The encoder on tensors alone: (b, 3, h, w) -> (b, n, c)."""
         x = self.patch_embed(images).float()
@@ -175,6 +165,18 @@ def _decoder(c: Mast3rConfig) -> nn.ModuleList:
 def _head(c: Mast3rConfig) -> Head:
     token_dims = (c.enc_dim, c.dec_dim, c.dec_dim, c.dec_dim)
     return Head(token_dims, c.dpt_layer_dims, c.dpt_channels, c.dpt_last, c.descriptor_dim, c.patch_px)
+
+
+Views = tuple[HeadOutput, HeadOutput]
+
+
+def in_both_orders(decode: Callable[[Encoded, Encoded], Views], a: Encoded, b: Encoded) -> tuple[Views, Views]:
+    """((a, b in a's camera), (b, a in b's camera)), as one batch where the grids are equal."""
+    if a.grid != b.grid:
+        return decode(a, b), decode(b, a)
+    first, second = decode(stacked([a, b]), stacked([b, a]))
+    n = len(a)
+    return (_rows(first, 0, n), _rows(second, 0, n)), (_rows(first, n, 2 * n), _rows(second, n, 2 * n))
 
 
 def _rows(out: HeadOutput, start: int, end: int) -> HeadOutput:
