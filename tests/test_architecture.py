@@ -42,9 +42,9 @@ LAYERS: dict[str, set[str]] = {
     "lens_view": {"geometry", "rectify"},
     "view_depth": {"geometry", "types", *STAGES},
     "parts": {*CONTRACTS, *STAGES, "networks", "lookahead"},
-    "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
+    "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lookahead"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
-    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "lookahead"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",

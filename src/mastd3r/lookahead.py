@@ -1,13 +1,36 @@
-"""The next items are made ready while the caller works on the one it was given; results do not depend on it."""
+"""Work beside the main loop: the next items made ready, values in the making. Results do not depend on it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 C = TypeVar("C")
+
+
+class Later(Generic[T]):
+    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised."""
+
+    def __init__(self, get: Callable[[], T]) -> None:
+        self.get = get
+
+    @staticmethod
+    def known(value: T) -> Later[T]:
+        """One that is there."""
+        return Later(lambda: value)
+
+
+class Beside:
+    """One thread beside the caller's: what is given to it is done in order."""
+
+    def __init__(self, name: str) -> None:
+        self._pool = ThreadPoolExecutor(1, name)
+
+    def later(self, make: Callable[[], T]) -> Later[T]:
+        """The value of ``make``, made there."""
+        return Later(self._pool.submit(make).result)
 
 
 def ahead(items: Iterator[T], work: Callable[[T, C], None], context: Callable[[], C]) -> Iterator[T]:
