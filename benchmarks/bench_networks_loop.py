@@ -18,7 +18,8 @@ from mastd3r.config import Config
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.finish import final_frames, trajectory_of
 from mastd3r.graph.places import PlaceIndex
-from mastd3r.networks.matching import match_pixels
+from mastd3r.networks.matching import RecordedMatching, match_pixels
+from mastd3r.networks.pair import PairNetwork
 from mastd3r.parts import Parts
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
 from mastd3r.pointmap.matching import FoundPixels, MatchOptions, subsampled
@@ -36,11 +37,12 @@ def _clip(b: Any) -> Clip | None:
     return b.clip
 
 
-def _matched_on(device: torch.device) -> Any:
-    """The matcher that the package takes there."""
-    if device.type == "cpu":
+def _matcher_of(network: PairNetwork) -> Any:
+    """The matcher that the package takes with it."""
+    if network.device.type == "cpu":
         return match_on_host
-    return lambda *arguments: FoundPixels(*match_pixels(*arguments))
+    search = match_pixels if network.recorder is None else RecordedMatching(network.recorder)
+    return lambda *arguments: FoundPixels(*search(*arguments))
 
 
 @torch.inference_mode()
@@ -56,14 +58,16 @@ def matching(b: Any) -> dict[str, Any]:
     h, w = pair.first.points.shape[:2]
     every = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2).astype(float)
     cells = np.concatenate([subsampled(h, w, 10)[0], subsampled(h, w, 8)[0]])
-    matcher, found = _matched_on(b.device), {}
-    for name, px, options in (
-        ("pixels of the loop", cells, MatchOptions()),
-        ("all pixels", every, MatchOptions()),
-        ("all pixels, and back", every, MatchOptions(reciprocal_px=1.0)),
-    ):
+    found = {}
+    cases = [("pixels of the loop", cells, MatchOptions(), truth.network)]
+    if b.execution == "graph":
+        cases.append(("pixels of the loop, recorded", cells, MatchOptions(), b.network("float32", "graph")))
+    cases.append(("all pixels", every, MatchOptions(), truth.network))
+    cases.append(("all pixels, and back", every, MatchOptions(reciprocal_px=1.0), truth.network))
+    for name, px, options, network in cases:
+        matcher = _matcher_of(network)
         answer = matcher(pair.first, pair.second, px, None, options)
-        timed = b.timed(lambda p=px, o=options: matcher(pair.first, pair.second, p, None, o), 5)
+        timed = b.timed(lambda p=px, o=options, m=matcher: m(pair.first, pair.second, p, None, o), 5)
         found[name] = {**timed, "pixels": len(px), "matched_ratio": round(float(answer.valid.mean()), 4)}
     return found
 
@@ -149,7 +153,7 @@ def _tracked(b: Any, truth: TruthNetwork, frames: int) -> dict[str, Any]:
     """One pass over the first frames: frames/s, what was asked of the network, states, error, milliseconds a stage."""
     clip, config = truth.clip, Config()
     width, height = working_size_of(truth, clip.size)
-    matcher = _matched_on(b.device)
+    matcher = _matcher_of(truth.network)
     most = 4 if b.device.type == "cpu" else 24
     provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
     places = PlaceIndex(provider.place_descriptor)

@@ -147,7 +147,7 @@ def _mast3r(config: Config, source: Source) -> Parts:
         raise ConfigError(f"networks.long_side_px: expected a multiple of 16 from 64 on, got {c.long_side_px}")
     path = weights.path(c.mast3r)
     from .networks.load import load_pair_network
-    from .networks.matching import match_pixels
+    from .networks.matching import RecordedMatching, match_pixels
     from .pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
     from .pointmap.matching import FoundPixels
 
@@ -156,8 +156,10 @@ def _mast3r(config: Config, source: Source) -> Parts:
     network = load_pair_network(path, device, precision, c.long_side_px, execution)
     width, height = working_size_of(network, source.size)
 
+    search = RecordedMatching(network.recorder) if network.recorder is not None else match_pixels
+
     def match_there(*arguments: Any) -> FoundPixels:
-        return FoundPixels(*match_pixels(*arguments))
+        return FoundPixels(*search(*arguments))
 
     matcher, most = (match_on_host, 4) if device == "cpu" else (match_there, 24)  # a pair takes 46 MB at 512 x 384
     provider = Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)

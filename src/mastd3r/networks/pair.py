@@ -118,17 +118,18 @@ class PairNetwork:
         self.encode_images, self.decode_views = self.model.encode, self.model.decode  # on tensors
         if execution == "graph" and not can_record(self.device):
             raise ConfigError(f"network execution 'graph': expected a CUDA device, got {device!r}")
-        if execution == "graph":
-            self._record()
+        self.recorder = Recorder(self.device) if execution == "graph" else None
+        if self.recorder is not None:
+            self._record(self.recorder)
         if execution == "compile":
             for name in ("encode_tokens", "decode_tokens"):
                 setattr(self.model, name, torch.compile(getattr(self.model, name), dynamic=False))
             for head in (self.model.downstream_head1, self.model.downstream_head2):
                 head.compile(dynamic=False)
 
-    def _record(self) -> None:
+    def _record(self, recorder: Recorder) -> None:
         """The layers as recordings of plain tensors, one a shape."""
-        recorder, patch = Recorder(self.device), self.model.config.patch_px
+        patch = self.model.config.patch_px
         encode = recorder.recorded(lambda images: self.model.encode(images).tokens)
 
         def encoded(images: Tensor) -> Encoded:

@@ -18,7 +18,7 @@ from torch.utils._pytree import tree_map_only
 
 log = logging.getLogger(__name__)
 WARM_CALLS = 3  # before a recording: libraries choose and set up their kernels then
-MOST_SHAPES = 6  # recordings keep the memory of their layers; beyond, layers are launched one by one
+MOST_SHAPES = 6  # of one call; recordings keep the memory of their layers; beyond, layers are launched one by one
 
 
 @dataclass(frozen=True)
