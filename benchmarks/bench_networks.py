@@ -16,6 +16,7 @@ The file is written after every part; a part that fails is recorded in one line,
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import os
 import platform
@@ -36,6 +37,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
 
 import numpy as np
 import torch
+from torch import nn
 
 from mastd3r.errors import SlamError
 from mastd3r.networks.mast3r import Encoded, Mast3r, Mast3rConfig, weight_law
@@ -66,6 +68,7 @@ class Bench:
         self.auto = "float32" if self.device.type == "cpu" else "bfloat16"  # as the package chooses
         self.execution = "eager"  # of the loop: "graph", as the package chooses on CUDA, once the part of it went well
         self._master: Mast3r | None = None
+        self._other = (0, 0)  # bytes on the device that belong to other things than the one measured
         self.result: dict[str, Any] = {"parts": {}, "failed": {}, "left_out": {}}
 
     def master(self) -> Mast3r:
@@ -78,6 +81,7 @@ class Bench:
         """Ours, in a setting of its own; TF32 is set for everything that follows."""
         precision, tf32 = SETTINGS[setting]
         allow_tf32(tf32)
+        self.without(self.master(), False)
         long_side = max(self.size)
         return PairNetwork(deepcopy(self.master()), str(self.device), precision, execution, long_side)
 
@@ -116,12 +120,27 @@ class Bench:
         found = {"ms": round(middle, 3), "ms_in_a_row": round(row_ms, 3), "per_s": round(1e3 / row_ms, 2)}
         return {**found, **self.peak()}
 
+    def without(self, model: nn.Module, counted: bool) -> None:
+        """What is on the device now is not counted in peaks, but for the weights of ``model`` where it is measured."""
+        if self.device.type == "cuda":
+            gc.collect()
+            torch.cuda.empty_cache()
+            weights = sum(p.numel() * p.element_size() for p in model.parameters()) if counted else 0
+            self._other = torch.cuda.memory_allocated() - weights, torch.cuda.memory_reserved() - weights
+
     def reset_peak(self) -> None:
         if self.device.type == "cuda":
             torch.cuda.reset_peak_memory_stats()
 
     def peak(self) -> dict[str, Any]:
-        return {"peak_mib": round(torch.cuda.max_memory_allocated() / 2**20)} if self.device.type == "cuda" else {}
+        """Largest sum of tensors, and what was taken from the device for it: recordings keep memory of their own."""
+        if self.device.type != "cuda":
+            return {}
+        tensors, taken = torch.cuda.max_memory_allocated(), torch.cuda.max_memory_reserved()
+        return {
+            "peak_mib": round((tensors - self._other[0]) / 2**20),
+            "taken_mib": round((taken - self._other[1]) / 2**20),
+        }
 
     def write(self) -> None:
         self.options.out.write_text(json.dumps(self.result, indent=1) + "\n", encoding="utf-8")
@@ -246,6 +265,7 @@ def reference(b: Bench) -> dict[str, Any]:
     net = reference_network(b.options.reference, config, state)
     model = own_network(net, config)
     one, two = b.images()
+    b.without(net, counted=True)  # it shares the weights
     allow_tf32(False)
     theirs, ours = run_reference(net, one, two), run_own(model, one, two)
     found: dict[str, Any] = {"own_from_reference": errors(_as_outputs(ours), _as_outputs(theirs))}

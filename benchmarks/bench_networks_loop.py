@@ -140,6 +140,7 @@ def loop(b: Any) -> dict[str, Any]:
         images = [torch.from_numpy(network.prepare(f.image).image[None]).to(b.device) for f in clip.frames[:2]]
         network_alone = b.timed(bench.alone(network, images))
     truth = TruthNetwork(network, clip)
+    b.without(network.model, counted=True)
     _tracked(b, truth, min(WARM_FRAMES, len(clip.frames)))
     b.reset_peak()
     found = {"execution": b.execution, "network_alone": network_alone, "loop": _tracked(b, truth, len(clip.frames))}
