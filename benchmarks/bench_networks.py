@@ -319,8 +319,21 @@ def machine(b: Bench) -> dict[str, Any]:
         "torch": torch.__version__, "python": platform.python_version(), "cores": os.cpu_count(),
         "size": f"{b.size[0]}x{b.size[1]}", "small": b.small,
         "parameters": sum(p.numel() for p in b.master().parameters()),
-        "command": "python benchmarks/bench_networks.py " + " ".join(sys.argv[1:]),
+        "command": "python benchmarks/bench_networks.py " + " ".join(_words()),
     }  # fmt: skip
+
+
+def _words() -> list[str]:
+    """The command line, with names in place of this machine's paths."""
+    words = list(sys.argv[1:])
+    for option, name in (
+        ("--out", "benchmarks/results/networks.json"),
+        ("--sequence", "SEQUENCE"),
+        ("--reference", "DIR"),
+    ):
+        if option in words:
+            words[words.index(option) + 1] = name
+    return words
 
 
 def main() -> None:
