@@ -62,9 +62,13 @@ class Comparer:
         return bool(enough) and view.alignment.inlier_ratio >= self.config.tracking.min_inlier_ratio
 
     def recognised(self, kf: Keyframe, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
-        """``work`` seen from a keyframe that it may never have been near: features start the flow, then as ever."""
-        start = self.parts.features.flow(kf.work.gray, work.gray)
-        if start is None:
+        """``work`` seen from a keyframe that it may never have been near, then as ever.
+
+        A provider that finds what is far needs no start; for the others corner features give one.
+        """
+        far = self.parts.provider.finds_far
+        start = None if far else self.parts.features.flow(kf.work.gray, work.gray)
+        if start is None and not far:
             return None
         view = self.compare(kf, work, prior, start, np.eye(4))
         return view if self.believed(view) else None

@@ -101,7 +101,7 @@ class Mast3rPointmaps(Observing):
     """Provider over an injected network. It remembers tokens and pairs; one thread at a time asks the network."""
 
     name = "mast3r"
-    finds_far = True  # descriptors are compared over the whole view where there is no start
+    finds_far = True  # the search on rays finds its way from the same pixel, without a start
     # Chosen, not measured: errors of such depths are of this order after their scale is found, and are smooth.
     depth_sigma_ratio: float | None = 0.08
 
