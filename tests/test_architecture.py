@@ -48,6 +48,7 @@ LAYERS: dict[str, set[str]] = {
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
+        "view_depth",
     },
     "cli_weights": {"errors", "networks", "progress"},
     "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights"},

@@ -128,6 +128,12 @@ def test_a_side_that_is_not_whole_patches_is_refused(tiny: Path, side: int) -> N
         parts.build_parts(with_networks(pointmaps="mast3r", mast3r=str(tiny), long_side_px=side), Clip())
 
 
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.0, float("nan")])
+def test_a_depth_sigma_that_is_no_share_is_refused(tiny: Path, share: float) -> None:
+    with pytest.raises(ConfigError, match=r"networks\.depth_sigma_ratio: expected a share"):
+        parts.build_parts(with_networks(pointmaps="mast3r", mast3r=str(tiny), depth_sigma_ratio=share), Clip())
+
+
 def test_settings_of_the_networks_are_read_and_checked() -> None:
     assert with_override(Config(), "networks.precision=float16").networks.precision == "float16"
     with pytest.raises(ConfigError, match=r"networks\.precision"):

@@ -143,6 +143,8 @@ def _execution(config: NetworksConfig, device: str) -> str:
 def _mast3r(config: Config, source: Source) -> Parts:
     """The network provider. Raises InputError that names the command which brings the weights."""
     c = config.networks
+    if not 0 < c.depth_sigma_ratio < 1:
+        raise ConfigError(f"networks.depth_sigma_ratio: expected a share between 0 and 1, got {c.depth_sigma_ratio}")
     if c.long_side_px < 64 or c.long_side_px % 16:
         raise ConfigError(f"networks.long_side_px: expected a multiple of 16 from 64 on, got {c.long_side_px}")
     path = weights.path(c.mast3r)
@@ -155,14 +157,12 @@ def _mast3r(config: Config, source: Source) -> Parts:
     precision, execution = _precision(c, device), _execution(c, device)
     network = load_pair_network(path, device, precision, c.long_side_px, execution)
     width, height = working_size_of(network, source.size)
-
-    search = RecordedMatching(network.recorder) if network.recorder is not None else match_pixels
-
-    def match_there(*arguments: Any) -> FoundPixels:
-        return FoundPixels(*search(*arguments))
-
-    matcher, most = (match_on_host, 4) if device == "cpu" else (match_there, 24)  # a pair takes 46 MB at 512 x 384
-    provider = Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
+    matcher, most = match_on_host, 4
+    if device != "cpu":
+        search = match_pixels if network.recorder is None else RecordedMatching(network.recorder)
+        matcher, most = (lambda *given: FoundPixels(*search(*given))), 24  # a pair takes 46 MB at 512 x 384
+    options: dict[str, Any] = {"remembered_pairs": most, "depth_sigma_ratio": c.depth_sigma_ratio}
+    provider = Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, **options)
     note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, {execution}, working image {width}x{height}"
     places = PlaceIndex(provider.place_descriptor)
     parts = Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)

@@ -102,8 +102,6 @@ class Mast3rPointmaps(Observing):
 
     name = "mast3r"
     finds_far = True  # the search on rays finds its way from the same pixel, without a start
-    # Chosen, not measured: errors of such depths are of this order after their scale is found, and are smooth.
-    depth_sigma_ratio: float | None = 0.08
 
     def __init__(
         self,
@@ -116,6 +114,7 @@ class Mast3rPointmaps(Observing):
         matcher: Matcher = match_on_host,
         remembered_frames: int = 48,
         remembered_pairs: int = 4,
+        depth_sigma_ratio: float = 0.08,
     ) -> None:
         """``width`` and ``height`` are those of ``working_size_of``; maps on a device want a matcher for them."""
         self.network, self.width, self.height, self.cell_px = network, width, height, cell_px
@@ -123,6 +122,7 @@ class Mast3rPointmaps(Observing):
         self._look = GeometricPointmaps(width, height, cell_px)
         self._encoded: _Remembered[Any] = _Remembered(remembered_frames)
         self._pairs: _Remembered[Any] = _Remembered(remembered_pairs)
+        self.depth_sigma_ratio: float | None = depth_sigma_ratio
         self._serial = itertools.count()
         self._asking = RLock()
 
