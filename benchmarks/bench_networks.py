@@ -269,6 +269,7 @@ def reference(b: Bench) -> dict[str, Any]:
     allow_tf32(False)
     theirs, ours = run_reference(net, one, two), run_own(model, one, two)
     found: dict[str, Any] = {"own_from_reference": errors(_as_outputs(ours), _as_outputs(theirs))}
+    found["rope"] = type(net.rope).__module__  # "models.curope…" where its own CUDA kernel was built
     shape = torch.tensor([one.shape[-2:]])
     keyframe, at, _ = net._encode_image(one, shape)
 

@@ -7,6 +7,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import numpy as np
 import torch
 
 from mastd3r.config import Config
+from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.finish import final_frames, trajectory_of
 from mastd3r.graph.places import PlaceIndex
@@ -24,6 +26,7 @@ from mastd3r.parts import Parts
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
 from mastd3r.pointmap.matching import FoundPixels, MatchOptions, subsampled
 from mastd3r.slam import Slam
+from mastd3r.types import Frame
 from truth_network import Clip, Seen, TruthNetwork
 
 WARM_FRAMES = 50  # of the loop, before anything is timed: kernels are compiled, caches filled
@@ -144,13 +147,36 @@ def loop(b: Any) -> dict[str, Any]:
     _tracked(b, truth, min(WARM_FRAMES, len(clip.frames)))
     b.reset_peak()
     found = {"execution": b.execution, "network_alone": network_alone, "loop": _tracked(b, truth, len(clip.frames))}
+    with suppress(ImportError):  # transformers
+        found["loop_with_dinov2"] = _tracked(b, truth, len(clip.frames), _dinov2_for_its_time(b))
     truth.run_layers = False
     found["loop_without_decoders"] = _tracked(b, truth, len(clip.frames))
+    eager = b.result["parts"].get("precision", {}).get("bfloat16")
+    if eager and b.execution != "eager":
+        found["loop_over_network_layer_by_layer"] = round(found["loop"]["per_s"] / eager["per_s"], 4)
     found["loop_over_network"] = round(found["loop"]["per_s"] / network_alone["per_s"], 4)
     return found
 
 
-def _tracked(b: Any, truth: TruthNetwork, frames: int) -> dict[str, Any]:
+def _dinov2_for_its_time(b: Any) -> Callable[[Frame], Frame]:
+    """Features and prior as the package makes them, from random weights; the answer is that nothing is known."""
+    from mastd3r.networks.dinov2 import Dinov2Features
+    from mastd3r.networks.foreground import ForegroundPrior
+
+    with tempfile.TemporaryDirectory() as folder:
+        _random_dinov2(Path(folder), b.small)
+        features, prior = Dinov2Features(folder, str(b.device), b.auto), ForegroundPrior()
+    unknown = DynamicsConfig().base_rate
+
+    def fill(frame: Frame) -> Frame:
+        return replace(frame, semantic=np.full_like(prior(features.one(frame.image).features), unknown))
+
+    return fill
+
+
+def _tracked(
+    b: Any, truth: TruthNetwork, frames: int, semantic: Callable[[Frame], Frame] | None = None
+) -> dict[str, Any]:
     """One pass over the first frames: frames/s, what was asked of the network, states, error, milliseconds a stage."""
     clip, config = truth.clip, Config()
     width, height = working_size_of(truth, clip.size)
@@ -159,6 +185,7 @@ def _tracked(b: Any, truth: TruthNetwork, frames: int) -> dict[str, Any]:
     provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
     places = PlaceIndex(provider.place_descriptor)
     parts = Parts(provider, (width, height), places=places, own_scale_known=False, pairs_ahead=b.device.type != "cpu")
+    parts.semantic = semantic
     slam = Slam(config, parts, clip.size)
     truth.encoded = truth.decoded = 0
     stages: dict[str, list[float]] = defaultdict(list)

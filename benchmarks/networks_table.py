@@ -57,7 +57,12 @@ def _ratios(parts: dict[str, Any], against: dict[str, Any]) -> list[str]:
         for part, how in (("precision", "layer by layer"), ("graphed", "recorded"), ("compiled", "compiled"))
         for name, v in parts.get(part, {}).items()
     ]
-    return ["", "Frames/s over those of the reference in its own setting: " + "; ".join(found) + "."]
+    said = ["", "Frames/s over those of the reference in its own setting: " + "; ".join(found) + "."]
+    if "curope" not in parts["reference"].get("rope", ""):
+        said[-1] += (
+            " Its optional CUDA kernel for rotary positions was not built; its own PyTorch code ran in its place."
+        )
+    return said
 
 
 def _errors(parts: dict[str, Any]) -> list[str]:
@@ -79,12 +84,15 @@ def _others(parts: dict[str, Any]) -> list[str]:
 def _loop(found: dict[str, Any] | None) -> list[str]:
     if not found:
         return []
-    e = found["loop"]
+    e, dino = found["loop"], found.get("loop_with_dinov2")
     states = ", ".join(f"{n} {s}" for s, n in e["states"].items())
     error = "–" if e["ate_rmse_m"] is None else f"{e['ate_rmse_m']:.4f} m"
     out = ["", f"The tracking loop over {e['frames']} frames ({states}; ATE {error}; {e['encoded']} encodings, "
            f"{e['decoded']} decodings): **{e['per_s']:.1f} frames/s, {found['loop_over_network']:.2f} of the network "
            f"alone** ({found['network_alone']['per_s']:.1f}, {found['execution']}). Without the decoders' time: "
            f"{found['loop_without_decoders']['per_s']:.1f}."]  # fmt: skip
+    if "loop_over_network_layer_by_layer" in found:
+        out[-1] += f" Over the network launched layer by layer: {found['loop_over_network_layer_by_layer']:.2f}."
+    out[-1] += f" With DINOv2 beside it: {dino['per_s']:.1f}." if dino else ""
     rows = [[name, f"{value:.2f}"] for name, value in e["stage_ms_a_frame"].items() if value >= 0.05]
     return out + _table(["stage, what it calls included; ahead and beside: in other threads", "ms a frame"], rows)
