@@ -346,3 +346,19 @@ def test_unknown_precision_and_device_are_refused(tiny: Mast3r) -> None:
         PairNetwork(tiny, execution="magic")
     with pytest.raises(ConfigError, match="'graph': expected a CUDA device, got 'cpu'"):
         PairNetwork(tiny, execution="graph")
+
+
+@pytest.mark.parametrize(("dtype", "inside"), [("float32", ("highest", False)), ("bfloat16", ("high", True))])
+def test_products_round_only_in_half_precision_and_only_inside(dtype: str, inside: tuple[str, bool]) -> None:
+    """The heads of a network in half precision may take TF32; what else the process computes keeps its setting."""
+
+    def setting() -> tuple[str, bool]:
+        return torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+
+    network = PairNetwork(random_mast3r(Mast3rConfig.tiny()), dtype=dtype, long_side_px=96)
+    seen: list[tuple[str, bool]] = []
+    network.model.downstream_head1.register_forward_hook(lambda *_: seen.append(setting()))
+    network.model.enc_norm.register_forward_hook(lambda *_: seen.append(setting()))
+    before = setting()
+    pair_of(network, symmetric=True)
+    assert seen == [inside] * 3 and setting() == before

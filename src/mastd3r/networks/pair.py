@@ -5,8 +5,7 @@ Nothing here asks the caller for a tensor; ``EncodedFrame`` is opaque and may be
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
@@ -20,6 +19,7 @@ from ..errors import ConfigError
 from .dpt import HeadOutput
 from .mast3r import Encoded, Mast3r, in_both_orders, stacked
 from .preprocess import LONG_SIDE_PX, PixelMapping, prepare_image
+from .products import products
 from .record import Recorder, can_record
 
 Array = NDArray[Any]
@@ -114,7 +114,7 @@ class PairNetwork:
             for conv in (m for m in self.model.modules() if isinstance(m, nn.Conv2d | nn.ConvTranspose2d)):
                 # the order that tokens come in, and fast kernels want
                 conv.weight.data = conv.weight.data.to(memory_format=torch.channels_last)
-        self.long_side_px, self.rounds = long_side_px, dtype != "float32"
+        self.long_side_px, self.dtype = long_side_px, PRECISIONS[dtype]
         self.encode_images, self.decode_views = self.model.encode, self.model.decode  # on tensors
         if execution == "graph" and not can_record(self.device):
             raise ConfigError(f"network execution 'graph': expected a CUDA device, got {device!r}")
@@ -151,18 +151,6 @@ class PairNetwork:
 
         self.encode_images, self.decode_views = encoded, decoded
 
-    @contextmanager
-    def _products(self) -> Iterator[None]:
-        """How float32 products round while the network runs; the process's own setting is put back."""
-        before = torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
-        torch.set_float32_matmul_precision("high" if self.rounds else "highest")
-        torch.backends.cudnn.allow_tf32 = self.rounds
-        try:
-            yield
-        finally:
-            torch.set_float32_matmul_precision(before[0])
-            torch.backends.cudnn.allow_tf32 = before[1]
-
     def prepare(self, image: Array) -> Prepared:
         """(H, W, 3) uint8 RGB -> network image and pixel mapping. Raises InputError."""
         values, mapping = prepare_image(image, self.long_side_px)
@@ -175,8 +163,10 @@ class PairNetwork:
     @torch.inference_mode()
     def encode_batch(self, prepared: Sequence[Prepared]) -> list[EncodedFrame]:
         """The same of several frames of one size, in one pass. Raises ValueError where sizes differ."""
-        images = torch.from_numpy(np.stack([p.image for p in prepared])).to(self.device)
-        with self._products():
+        images = torch.from_numpy(np.stack([p.image for p in prepared]))
+        if self.device.type != "cpu":  # from locked memory, so that this thread need not wait for the device's queue
+            images = images.pin_memory().to(self.device, non_blocking=True)
+        with products(self.dtype):
             encoded = self.encode_images(images)
         return [
             EncodedFrame(Encoded(encoded.tokens[n : n + 1], encoded.grid), p.mapping, p.height, p.width)
@@ -193,7 +183,7 @@ class PairNetwork:
         if not pairs:
             return []
         a, b = stacked([a.encoded for a, _ in pairs]), stacked([b.encoded for _, b in pairs])
-        with self._products():
+        with products(self.dtype):
             orders = in_both_orders(self.decode_views, a, b) if symmetric else (self.decode_views(a, b),)
         found = [[NetworkPair(_view(one, n), _view(two, n)) for n in range(len(pairs))] for one, two in orders]
         return [replace(there, reverse=back) for there, back in zip(*found, strict=True)] if symmetric else found[0]

@@ -19,7 +19,7 @@ import itertools
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, fields, replace
-from threading import RLock
+from threading import Lock, RLock
 from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
@@ -164,7 +164,7 @@ class Mast3rPointmaps(Observing):
         """Decode both orders of these pairs in one pass, if they can all be remembered until they are asked for."""
         orders = [(a, b) for pair in pairs for a, b in (pair, pair[::-1])]
         frames = [(_network_frame(a), _network_frame(b)) for a, b in orders]
-        wanted = [p for p in frames if _serials(p) not in self._pairs]
+        wanted = [p for p in frames if self._pairs.get(_serials(p)) is None]
         if len(wanted) <= self._pairs.most - SPARE_PAIRS:
             self._decode_all(wanted)
 
@@ -192,24 +192,25 @@ class Mast3rPointmaps(Observing):
     # -- the network, each thing once ------------------------------------------------------------------------
 
     def _tokens(self, frame: NetworkFrame) -> Any:
-        with self._asking:
-            if frame.serial not in self._encoded:
-                self._encoded.put(frame.serial, self.network.encode(frame.prepared))
-            return self._encoded.get(frame.serial)
+        found = self._encoded.get(frame.serial)
+        if found is None:
+            with self._asking:
+                found = self._encoded.get(frame.serial) or self.network.encode(frame.prepared)
+                self._encoded.put(frame.serial, found)
+        return found
 
     def _decoded(self, first: NetworkFrame, second: NetworkFrame) -> Any:
-        with self._asking:
-            if (first.serial, second.serial) not in self._pairs:
-                self._decode_all([(first, second)])
-            return self._pairs.get((first.serial, second.serial))
+        found = self._pairs.get((first.serial, second.serial))  # without waiting for what another thread asks
+        return found or self._decode_all([(first, second)])[0]
 
-    def _decode_all(self, pairs: Sequence[tuple[NetworkFrame, NetworkFrame]]) -> None:
+    def _decode_all(self, pairs: Sequence[tuple[NetworkFrame, NetworkFrame]]) -> Sequence[Any]:
         if not pairs:
-            return
+            return []
         with self._asking:
             found = self.network.pairs([(self._tokens(a), self._tokens(b)) for a, b in pairs])
             for pair, decoded in zip(pairs, found, strict=True):
                 self._pairs.put(_serials(pair), decoded)
+        return found
 
     def _matches(self, ref: NetworkFrame, new: NetworkFrame, pair: Any, start: Array | None) -> tuple[Matches, Array]:
         """Matches of ref's chosen pixels, and the dense flow ref -> new (h, w, 2) float32."""
@@ -247,20 +248,20 @@ class _Remembered(Generic[T]):
     """The values of the last few keys that were put or asked for."""
 
     def __init__(self, most: int) -> None:
-        self.most, self._values = most, OrderedDict[Hashable, T]()
-
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._values
+        self.most, self._values, self._lock = most, OrderedDict[Hashable, T](), Lock()
 
     def put(self, key: Hashable, value: T) -> None:
-        self._values[key] = value
-        self._values.move_to_end(key)
-        while len(self._values) > self.most:
-            self._values.popitem(last=False)
+        with self._lock:
+            self._values[key] = value
+            self._values.move_to_end(key)
+            while len(self._values) > self.most:
+                self._values.popitem(last=False)
 
-    def get(self, key: Hashable) -> T:
-        self._values.move_to_end(key)
-        return self._values[key]
+    def get(self, key: Hashable) -> T | None:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+            return self._values.get(key)
 
 
 def _serials(pair: tuple[NetworkFrame, NetworkFrame]) -> tuple[int, int]:
