@@ -15,7 +15,8 @@ from mastd3r.lookahead import Later
 from mastd3r.parts import Parts
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
-from test_pointmap_mast3r import FULL, TrueNetwork, photograph, provider_of
+from mastd3r.types import Guess
+from test_pointmap_mast3r import FULL, WORK, TrueNetwork, photograph, provider_of
 
 
 class NoFeatures:
@@ -61,3 +62,17 @@ def test_without_a_network_features_start_the_flow() -> None:
     work = parts.observe(photograph(0.1))
     assert slam.comparer.recognised(slam.graph.keyframes[0], work, NOTHING_MOVES) is None
     assert isinstance(features, NoFeatures) and features.asked == 1
+
+
+def test_expected_pairs_are_decoded_once_in_both_orders() -> None:
+    """As one batch where they can be remembered until they are asked for; else when they are asked for."""
+    for most, decoded in ((8, 4), (4, 0)):
+        network = TrueNetwork()
+        provider = provider_of(network, remembered_pairs=most)
+        a, b, c = (provider.look(photograph(t)) for t in (0.0, 0.2, 0.4))
+        provider.expect([(a, c), (b, c)])
+        assert network.decoded == decoded
+        a, b, c = (provider.beside(work, other) for work, other in ((a, c), (b, c), (c, a)))
+        for ref, new in ((a, c), (c, a), (b, c), (c, b)):
+            provider.predict(ref, new, Guess(WORK))
+        assert network.decoded == 4 and network.encoded == 3
