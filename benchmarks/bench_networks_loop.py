@@ -72,7 +72,18 @@ def matching(b: Any) -> dict[str, Any]:
         answer = matcher(pair.first, pair.second, px, None, options)
         timed = b.timed(lambda p=px, o=options, m=matcher: m(pair.first, pair.second, p, None, o), 5)
         found[name] = {**timed, "pixels": len(px), "matched_ratio": round(float(answer.valid.mean()), 4)}
+        if len(px) < len(every):
+            found[name]["against_host"] = _agreement(answer, match_on_host(pair.first, pair.second, px, None, options))
     return found
+
+
+def _agreement(one: FoundPixels, other: FoundPixels) -> dict[str, float]:
+    """Share of pixels on which both say found, or both not; and how far apart they found them, px."""
+    both = one.valid & other.valid
+    away = np.linalg.norm(one.px - other.px, axis=1)[both]
+    apart = [float(f"{v:.2e}") for v in (np.median(away), np.quantile(away, 0.99))] if len(away) else [0.0, 0.0]
+    same = round(float((one.valid == other.valid).mean()), 5)
+    return {"same_verdict_ratio": same, "apart_px_median": apart[0], "apart_px_99": apart[1]}
 
 
 @torch.inference_mode()

@@ -78,7 +78,13 @@ def _errors(parts: dict[str, Any]) -> list[str]:
 def _others(parts: dict[str, Any]) -> list[str]:
     rows = [["matching: " + k, *_row(k, v)[1:]] for k, v in parts.get("matching", {}).items()]
     rows += [["DINOv2: " + k, *_row(k, v)[1:]] for k, v in parts.get("dinov2", {}).items()]
-    return _table(["beside it", "ms", "a second", "memory [MiB]"], rows)
+    lines = _table(["beside it", "ms", "a second", "memory [MiB]"], rows)
+    for name, v in parts.get("matching", {}).items():
+        if agreed := v.get("against_host"):
+            lines += ["", f"Matching, {name}, against numba on the host: {agreed['same_verdict_ratio']:.2%} of the "
+                      f"verdicts are the same, pixels {agreed['apart_px_median']:.1e} px apart in the median, "
+                      f"{agreed['apart_px_99']:.1e} px at 99 %."]  # fmt: skip
+    return lines
 
 
 def _loop(found: dict[str, Any] | None) -> list[str]:
