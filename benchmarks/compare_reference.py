@@ -43,8 +43,10 @@ SMALL_PIXELS = 120
 PHOTOGRAPHS = ((640, 480), (480, 640), (1242, 375), (300, 201), (500, 500), (1023, 767), (2000, 1125))
 
 
-def reference_network(folder: Path, config: Mast3rConfig) -> torch.nn.Module:
-    """The reference's network of our sizes, with the seeded weights."""
+def reference_network(
+    folder: Path, config: Mast3rConfig, state: dict[str, torch.Tensor] | None = None
+) -> torch.nn.Module:
+    """The reference's network of our sizes, with the seeded weights or those of a state by its names."""
     sys.path[:0] = [str(folder), str(folder / "dust3r"), str(folder / "dust3r" / "croco")]
     from mast3r.model import AsymmetricMASt3R
 
@@ -64,8 +66,9 @@ def reference_network(folder: Path, config: Mast3rConfig) -> torch.nn.Module:
                     feature_dim=c.dpt_channels, last_dim=c.dpt_last, head_type="regression",
                 )  # fmt: skip
                 head.dpt.init([c.enc_dim, c.dec_dim, c.dec_dim, c.dec_dim])
-    shapes = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    state = {name: torch.from_numpy(value) for name, value in seeded_weights(shapes, SEED).items()}
+    if state is None:
+        shapes = {name: tuple(value.shape) for name, value in net.state_dict().items()}
+        state = {name: torch.from_numpy(value) for name, value in seeded_weights(shapes, SEED).items()}
     torch.nn.Module.load_state_dict(net, state, assign=True)
     return net.requires_grad_(False).eval()
 
@@ -250,7 +253,7 @@ def main() -> None:
         config = Mast3rConfig.released()
         net = reference_network(options.reference, config).to(options.device)
         model = own_network(net, config)
-        PairNetwork(model, options.device, options.own_precision, options.compile)
+        PairNetwork(model, options.device, options.own_precision, "compile" if options.compile else "eager")
         sizes = [tuple(int(v) for v in size.split("x")) for size in options.sizes]
         result = {
             "torch": torch.__version__, "machine": platform.processor() or platform.machine(),

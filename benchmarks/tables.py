@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from networks_table import networks
+
 COLUMNS: dict[str, tuple[str, str]] = {
     "frames_posed": ("posed", "d"),
     "frames": ("of", "d"),
@@ -64,6 +66,7 @@ def main() -> int:
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
+    lines += networks(source.parent / "networks.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
 
@@ -101,11 +104,14 @@ def reference(path: Path) -> list[str]:
         f"{path.as_posix()}`; DIR is the reader's own checkout of the reference, which is not part of this repository."
     )
     out += ["", "| size | largest relative error: points | confidence | descriptors | descriptor confidence |"]
-    out.append("|---" * 5 + "|")
+    out[-1] += " time of ours / the reference's, fastest of each |"
+    out.append("|---" * 6 + "|")
     for pair in e["pairs"]:
         worst = pair["max_relative_error"]
         kinds = ("points", "confidence", "descriptors", "descriptor_confidence")
         cells = [f"{max(worst[k + '1'], worst[k + '2']):.1e}" for k in kinds]
+        fastest = {who: min(seconds) for who, seconds in pair["seconds"].items()}
+        cells.append(f"{fastest['own'] / fastest['reference']:.2f}")
         out.append(f"| {pair['size']} | " + " | ".join(cells) + " |")
     return out
 

@@ -40,17 +40,19 @@ LAYERS: dict[str, set[str]] = {
     **{stage: {"geometry", *CONTRACTS} for stage in STAGES},
     "networks": {"geometry", "fetch", *CONTRACTS},
     "progress": set(),
+    "lookahead": set(),
     "rectify": {"geometry", "types", "errors"},
     "lens_view": {"geometry", "rectify"},
     "view_depth": {"geometry", "types", *STAGES},
-    "parts": {*CONTRACTS, *STAGES, "networks"},
-    "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
+    "parts": {*CONTRACTS, *STAGES, "networks", "lookahead"},
+    "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lookahead"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
-    "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare"},
-    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "loops"},
+    "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare", "lookahead"},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "lookahead", "loops"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
+        "view_depth",
     },
     "cli_weights": {"errors", "fetch", "networks", "progress"},
     "cli_download": {"errors", "fetch", "datasets", "progress"},
@@ -75,7 +77,7 @@ HEAVY = {  # package: who may import it
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights", "cli_download"},
 }
-NAMES_A_DEVICE = {"mapping.rasterise"}
+NAMES_A_DEVICE = {"mapping.rasterise", "networks.record"}  # the latter: recordings are CUDA's
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
 EXITS = {"cli", "__main__"}

@@ -69,6 +69,9 @@ class KnowsTheClip:
             self.views[seen.index] = view_of(camera, camera_pose(time_s), depth)
         return self.views[seen.index]
 
+    def pairs(self, pairs: Any) -> list[Any]:
+        return [self.pair(a, b) for a, b in pairs]
+
     def pair(self, a: Seen, b: Seen) -> Both:
         self.decoded += 1
         first, second = decoded(self.view(a), self.view(b), 0.1)
@@ -98,6 +101,8 @@ def test_a_network_that_knows_the_truth(room_clip: Path, tmp_path: Path, monkeyp
     assert metrics["mask_iou"] > 0.42 and metrics["mask_false_positive_ratio"] < 0.04
     record = json.loads((out / "run.json").read_text())
     assert any("MASt3R" in note and "working image 160x120" in note for note in record["choices"])
+    spread = next(note for note in record["choices"] if "own depths differ" in note)
+    assert float(spread.split("by ")[1].split("%")[0]) < 1.0 and "assumed 8.0%" in spread  # it knows the truth
     # first pass: one decode a frame, two more where keyframes are matched; second pass: one a frame
     assert network.decoded < 2.5 * 24
 

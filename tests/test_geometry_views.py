@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from mastd3r.geometry.camera import Camera
 from mastd3r.lens_view import LensView
 from mastd3r.second_pass import is_holdout, uncertainty_weight
-from mastd3r.view_depth import cell_centres, chained_flow, invert_flow, static_at
+from mastd3r.view_depth import cell_centres, chained_flow, invert_flow, own_depth_spread, static_at
 
 Array = NDArray[Any]
 
@@ -101,3 +102,26 @@ def test_uncertainty_of_eq_16() -> None:
 
 def test_every_eighth_frame_is_held_out() -> None:
     assert [n for n in range(25) if is_holdout(n)] == [0, 8, 16, 24]
+
+
+@pytest.mark.parametrize("sigma", [0.03, 0.12])
+def test_the_spread_of_own_depths_is_measured(sigma: float) -> None:
+    """Frames each of another scale, solved depths that lean on them; a point in twenty is far off."""
+    rng = np.random.default_rng(0)
+    y, x = np.divmod(np.arange(400), 20)
+    px = np.stack([10 * x + 5, 10 * y + 5], 1).astype(float)
+    keyframes, blocks = [], {}
+    for n in range(4):
+        inv_depth = rng.uniform(0.2, 1.0, 400)
+        away = rng.normal(0, sigma, 400)
+        own = inv_depth * np.exp(away) * rng.uniform(0.5, 2)
+        own[rng.random(400) < 0.05] *= 3
+        dense = np.kron(own.reshape(20, 20), np.ones((10, 10))).astype(np.float32)
+        info = np.where(rng.random(400) < 0.7, 1e4, 10.0) / inv_depth**2  # a third is not fixed by matches
+        solved = np.where(info * inv_depth**2 > 100, inv_depth * np.exp(away / 3), 1.5 * inv_depth)
+        blocks[n] = SimpleNamespace(px=px, inv_depth=solved, depth_info=info, prior_info=info / 2)  # leans by a third
+        keyframes.append(SimpleNamespace(id=n, work=SimpleNamespace(own_inv_depth=dense)))
+    graph: Any = SimpleNamespace(keyframes=keyframes, blocks=blocks)
+    assert own_depth_spread(graph) == pytest.approx(sigma, rel=0.15)
+    graph.keyframes = [SimpleNamespace(id=0, work=SimpleNamespace(own_inv_depth=None))]
+    assert own_depth_spread(graph) is None

@@ -15,7 +15,15 @@ from torch import Tensor
 from mastd3r.errors import ConfigError
 from mastd3r.networks.dpt import Fusion, HeadOutput, points_from_raw
 from mastd3r.networks.layers import CrossAttention, SelfAttention
-from mastd3r.networks.mast3r import Encoded, Mast3r, Mast3rConfig, random_mast3r, seeded_weights, stacked
+from mastd3r.networks.mast3r import (
+    Encoded,
+    Mast3r,
+    Mast3rConfig,
+    in_both_orders,
+    random_mast3r,
+    seeded_weights,
+    stacked,
+)
 from mastd3r.networks.pair import NetworkPair, PairNetwork
 from mastd3r.networks.rope import rope_table, rotate
 
@@ -248,7 +256,7 @@ def test_a_batch_is_its_rows(tiny: Mast3r) -> None:
 @pytest.mark.parametrize("size", [(64, 48), (48, 64)])
 def test_both_orders_at_once_are_each_order_alone(tiny: Mast3r, size: tuple[int, int]) -> None:
     a, b = tiny.encode(noise_image(64, 48, 1)), tiny.encode(noise_image(*size, 2))
-    both = tiny.decode_symmetric(a, b)
+    both = in_both_orders(tiny.decode, a, b)
     for pair, (first, second) in zip(both, ((a, b), (b, a)), strict=True):
         for out, alone in zip(pair, tiny.decode(first, second), strict=True):
             same(out, alone)
@@ -322,7 +330,7 @@ def test_compiled_is_the_same_network(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "compile", tracing)
     model = random_mast3r(Mast3rConfig.tiny())
     plain = pair_of(PairNetwork(model, long_side_px=96), symmetric=True)
-    traced = pair_of(PairNetwork(model, long_side_px=96, compile=True), symmetric=True)
+    traced = pair_of(PairNetwork(model, long_side_px=96, execution="compile"), symmetric=True)
     assert len(compiled) == 4
     np.testing.assert_allclose(traced.second.points, plain.second.points, rtol=1e-4, atol=1e-5)
     assert traced.reverse is not None and plain.reverse is not None
@@ -334,3 +342,23 @@ def test_unknown_precision_and_device_are_refused(tiny: Mast3r) -> None:
         PairNetwork(tiny, dtype="int8")
     with pytest.raises(ConfigError, match="network device: expected one that torch has, got 'toaster'"):
         PairNetwork(tiny, device="toaster")
+    with pytest.raises(ConfigError, match="one of eager, graph, compile, got 'magic'"):
+        PairNetwork(tiny, execution="magic")
+    with pytest.raises(ConfigError, match="'graph': expected a CUDA device, got 'cpu'"):
+        PairNetwork(tiny, execution="graph")
+
+
+@pytest.mark.parametrize(("dtype", "inside"), [("float32", ("highest", False)), ("bfloat16", ("high", True))])
+def test_products_round_only_in_half_precision_and_only_inside(dtype: str, inside: tuple[str, bool]) -> None:
+    """The heads of a network in half precision may take TF32; what else the process computes keeps its setting."""
+
+    def setting() -> tuple[str, bool]:
+        return torch.get_float32_matmul_precision(), torch.backends.cudnn.allow_tf32
+
+    network = PairNetwork(random_mast3r(Mast3rConfig.tiny()), dtype=dtype, long_side_px=96)
+    seen: list[tuple[str, bool]] = []
+    network.model.downstream_head1.register_forward_hook(lambda *_: seen.append(setting()))
+    network.model.enc_norm.register_forward_hook(lambda *_: seen.append(setting()))
+    before = setting()
+    pair_of(network, symmetric=True)
+    assert seen == [inside] * 3 and setting() == before

@@ -128,6 +128,12 @@ def test_a_side_that_is_not_whole_patches_is_refused(tiny: Path, side: int) -> N
         parts.build_parts(with_networks(pointmaps="mast3r", mast3r=str(tiny), long_side_px=side), Clip())
 
 
+@pytest.mark.parametrize("share", [0.0, -0.1, 1.0, float("nan")])
+def test_a_depth_sigma_that_is_no_share_is_refused(tiny: Path, share: float) -> None:
+    with pytest.raises(ConfigError, match=r"networks\.depth_sigma_ratio: expected a share"):
+        parts.build_parts(with_networks(pointmaps="mast3r", mast3r=str(tiny), depth_sigma_ratio=share), Clip())
+
+
 def test_settings_of_the_networks_are_read_and_checked() -> None:
     assert with_override(Config(), "networks.precision=float16").networks.precision == "float16"
     with pytest.raises(ConfigError, match=r"networks\.precision"):
@@ -165,15 +171,15 @@ def test_on_an_accelerator_matching_stays_there(tiny: Path, monkeypatch: pytest.
     """Device and precision are handed on, and the matcher is torch's, which agrees with the host's."""
     asked: list[Any] = []
 
-    def loaded(path: Path, device: str, precision: str, side: int) -> PairNetwork:
-        asked.extend([device, precision, side])
+    def loaded(path: Path, device: str, precision: str, side: int, execution: str) -> PairNetwork:
+        asked.extend([device, precision, side, execution])
         return PairNetwork(random_mast3r(Mast3rConfig.tiny()), long_side_px=side)
 
     monkeypatch.setattr(load, "load_pair_network", loaded)
     device_is(monkeypatch, "gpu")
     config = with_networks(pointmaps="mast3r", semantics="none", mast3r=str(tiny), long_side_px=96)
     provider = parts.build_parts(config, Clip()).provider
-    assert isinstance(provider, Mast3rPointmaps) and asked == ["gpu", "bfloat16", 96]
+    assert isinstance(provider, Mast3rPointmaps) and asked == ["gpu", "bfloat16", 96, "graph"]
     a, b = (provider.observe(frame) for frame in Clip().frames())
     pair = provider._decoded(a, b)
     px = np.stack(np.meshgrid(np.arange(8, 88, 4), np.arange(8, 56, 4)), -1).reshape(-1, 2).astype(float)
@@ -189,6 +195,14 @@ def test_on_an_accelerator_matching_stays_there(tiny: Path, monkeypatch: pytest.
 )
 def test_precision(precision: Any, device: str, expected: str) -> None:
     assert parts._precision(NetworksConfig(precision=precision), device) == expected
+
+
+@pytest.mark.parametrize(
+    ("execution", "device", "expected"),
+    [("auto", "cpu", "eager"), ("auto", "gpu", "graph"), ("compile", "cpu", "compile"), ("eager", "gpu", "eager")],
+)
+def test_execution(execution: Any, device: str, expected: str) -> None:
+    assert parts._execution(NetworksConfig(execution=execution), device) == expected
 
 
 # -- DINOv2 ---------------------------------------------------------------------------------------------------

@@ -24,11 +24,10 @@ from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.pointmap.mast3r import (
     Mast3rPointmaps,
     NetworkFrame,
-    focal_from_points,
-    sample_smooth,
     working_size_of,
 )
 from mastd3r.pointmap.matching import FoundPixels
+from mastd3r.pointmap.network_view import focal_from_points, sample_smooth
 from mastd3r.sources.synthetic import room_camera
 from mastd3r.types import Frame, Guess, PairPrediction
 
@@ -65,6 +64,9 @@ class TrueNetwork:
     def encode(self, prepared: Known) -> Known:
         self.encoded += 1
         return prepared
+
+    def pairs(self, pairs: Any) -> list[Any]:
+        return [self.pair(a, b) for a, b in pairs]
 
     def pair(self, a: Known, b: Known) -> Any:
         self.decoded += 1
@@ -155,7 +157,7 @@ def test_frames_of_another_shape_are_refused() -> None:
     with pytest.raises(InputError, match="working size is 160x120, got 320x200 pixels, which give 160x100"):
         provider.observe(photograph(0.0, (320, 200)))
     alien = GeometricPointmaps(160, 120, CELL).observe(photograph(0.0))
-    with pytest.raises(TypeError, match="expected a frame of its own observe"):
+    with pytest.raises(TypeError, match="expected a frame of its own look"):
         provider.predict(alien, alien, Guess(WORK))
 
 
@@ -296,6 +298,9 @@ class Broken(TrueNetwork):
     def __init__(self, share: float) -> None:
         super().__init__()
         self.share, self.rng = share, np.random.default_rng(0)
+
+    def pairs(self, pairs: Any) -> list[Any]:
+        return [self.pair(a, b) for a, b in pairs]
 
     def pair(self, a: Known, b: Known) -> Any:
         said = super().pair(a, b)

@@ -13,6 +13,7 @@ from .alignment.reproject import StaticMatches
 from .alignment.result import Alignment
 from .config import Config
 from .graph.keyframe_graph import Keyframe, KeyframeGraph
+from .lookahead import Later
 from .parts import Parts
 from .types import Guess, Matches, PairPrediction, WorkFrame
 from .view_depth import static_at
@@ -37,14 +38,15 @@ class Comparer:
     def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph) -> None:
         self.config, self.parts, self.graph = config, parts, graph
 
-    def compare(self, ref: Keyframe, new: WorkFrame, prior: Array, flow: Array | None, guess: Array) -> TwoView:
-        """``prior`` (h, w) P(moving) in new; ``flow`` (h, w, 2) start ref -> new; ``guess`` (4, 4) new_from_ref."""
+    def compare(self, ref: Keyframe, new: WorkFrame, prior: Later[Array], flow: Array | None, guess: Array) -> TwoView:
+        """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new;
+        ``guess`` (4, 4) new_from_ref."""
         graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
         block = graph.blocks[ref.id]
         inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
         known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow)
         pair = self.parts.provider.predict(ref.work, new, known)  # III-A: both pointmaps, in ref's camera
-        weight = pair.matches.weight * ref.static * static_at(prior, pair.matches.new_px)  # (5)(6), softly
+        weight = pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)  # (5)(6), softly
         if started:
             info = graph.depth_info(ref.id)
             matches = StaticMatches(block.px, block.inv_depth, info, pair.matches.new_px, weight, graph.lens.g)
@@ -59,10 +61,14 @@ class Comparer:
         enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
         return bool(enough) and view.alignment.inlier_ratio >= self.config.tracking.min_inlier_ratio
 
-    def recognised(self, kf: Keyframe, work: WorkFrame, prior: Array) -> TwoView | None:
-        """``work`` seen from a keyframe that it may never have been near: features start the flow, then as ever."""
-        start = self.parts.features.flow(kf.work.gray, work.gray)
-        if start is None:
+    def recognised(self, kf: Keyframe, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
+        """``work`` seen from a keyframe that it may never have been near, then as ever.
+
+        A provider that finds what is far needs no start; for the others corner features give one.
+        """
+        far = self.parts.provider.finds_far
+        start = None if far else self.parts.features.flow(kf.work.gray, work.gray)
+        if start is None and not far:
             return None
         view = self.compare(kf, work, prior, start, np.eye(4))
         return view if self.believed(view) else None

@@ -15,6 +15,7 @@ from .graph.drift import Loop, spread_drift
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.places import PlaceIndex, overlaps
 from .graph.submaps import scale_between
+from .lookahead import Later
 from .view_depth import static_at
 
 Array = NDArray[Any]
@@ -39,8 +40,8 @@ def close_loops(comparer: Comparer, graph: KeyframeGraph, places: PlaceIndex) ->
         kf = graph.keyframes[j]
         far = [i for i in ids if i < j - APART and not graph.connected(i, j) and not _known(found, i, j)]
         for other in places.best(graph, kf.work, far, 2, MIN_LIKENESS):
-            there = comparer.recognised(other, kf.work, kf.moving / 255.0)
-            back = comparer.recognised(kf, other.work, other.moving / 255.0) if _strong(there) else None
+            there = comparer.recognised(other, kf.work, Later.known(kf.moving / 255.0))
+            back = comparer.recognised(kf, other.work, Later.known(other.moving / 255.0)) if _strong(there) else None
             loop = _loop(graph, other.id, j, there, back)
             if loop is None or there is None or back is None:
                 continue

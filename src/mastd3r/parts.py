@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .config import Config, NetworksConfig
 from .errors import ConfigError, InputError
 from .graph.places import PlaceIndex
+from .lookahead import ahead
 from .networks import weights
 from .pointmap.base import PointmapProvider
 from .pointmap.features import FeatureStart
@@ -19,6 +20,7 @@ from .pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, workin
 from .types import Frame, Source, WorkFrame
 
 Array = NDArray[Any]
+Near = Callable[[Frame], WorkFrame | None]  # what a frame is probably seen beside
 
 
 @dataclass
@@ -32,15 +34,48 @@ class Parts:
     notes: list[str] = field(default_factory=list)
     semantic: Callable[[Frame], Frame] | None = None  # fills Frame.semantic; None: what the source brings
     own_scale_known: bool = True  # False: the depth of every frame alone has a scale of its own
+    pairs_ahead: bool = False  # the provider decodes a frame's pair before its turn, beside the keyframe of that time
 
     def __post_init__(self) -> None:
         width, height = self.size
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self.grid_px = np.stack([x, y], -1)
+        self._foreseen: dict[int, _Foreseen] = {}
 
     def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
         """The frame with its semantic prior, as the provider sees it; ``near`` sees the same place."""
-        return self.provider.observe(frame if self.semantic is None else self.semantic(frame), near)
+        seen = self._foreseen.pop(frame.index, None)
+        if seen is None or seen.frame is not frame:
+            return self.provider.beside(self._look(frame), near)
+        return seen.work if seen.near is near and near is not None else self.provider.beside(seen.work, near)
+
+    def frames_ahead(self, frames: Iterator[Frame], near: Callable[[], Near]) -> Iterator[Frame]:
+        """The frames, each read, and looked at for ``observe``, while the caller works on the one before.
+
+        ``near`` is asked in the caller's thread, a frame ahead: the frame that ``observe`` will probably be given.
+        """
+        looked = ahead(frames, lambda frame, _: self._foresee(frame), lambda: None)
+        return ahead(looked, self._foresee_beside, near) if self.pairs_ahead else looked
+
+    def _look(self, frame: Frame) -> WorkFrame:
+        return self.provider.look(frame if self.semantic is None else self.semantic(frame))
+
+    def _foresee(self, frame: Frame) -> None:
+        self._foreseen[frame.index] = _Foreseen(frame, self._look(frame))
+
+    def _foresee_beside(self, frame: Frame, near: Near) -> None:
+        seen, other = self._foreseen[frame.index], near(frame)
+        if other is not None:
+            seen.work, seen.near = self.provider.beside(seen.work, other), other
+
+
+@dataclass
+class _Foreseen:
+    """A frame that was looked at before its turn."""
+
+    frame: Frame
+    work: WorkFrame
+    near: WorkFrame | None = None  # the frame that it was looked at beside; None: alone so far
 
 
 def build_parts(config: Config, source: Source) -> Parts:
@@ -101,31 +136,38 @@ def _precision(config: NetworksConfig, device: str) -> str:
     return config.precision if config.precision != "auto" else "float32" if device == "cpu" else "bfloat16"
 
 
+def _execution(config: NetworksConfig, device: str) -> str:
+    return config.execution if config.execution != "auto" else "eager" if device == "cpu" else "graph"
+
+
 def _mast3r(config: Config, source: Source) -> Parts:
     """The network provider. Raises InputError that names the command which brings the weights."""
     c = config.networks
+    if not 0 < c.depth_sigma_ratio < 1:
+        raise ConfigError(f"networks.depth_sigma_ratio: expected a share between 0 and 1, got {c.depth_sigma_ratio}")
     if c.long_side_px < 64 or c.long_side_px % 16:
         raise ConfigError(f"networks.long_side_px: expected a multiple of 16 from 64 on, got {c.long_side_px}")
     path = weights.path(c.mast3r)
     from .networks.load import load_pair_network
-    from .networks.matching import match_pixels
+    from .networks.matching import RecordedMatching, match_pixels
     from .pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
     from .pointmap.matching import FoundPixels
 
     device = _device()
-    precision = _precision(c, device)
-    network = load_pair_network(path, device, precision, c.long_side_px)
+    precision, execution = _precision(c, device), _execution(c, device)
+    network = load_pair_network(path, device, precision, c.long_side_px, execution)
     width, height = working_size_of(network, source.size)
-
-    def match_there(*arguments: Any) -> FoundPixels:
-        return FoundPixels(*match_pixels(*arguments))
-
-    provider = Mast3rPointmaps(
-        network, width, height, config.tracking.cell_px, matcher=match_on_host if device == "cpu" else match_there
-    )
-    note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, working image {width}x{height}"
+    matcher, most = match_on_host, 4
+    if device != "cpu":
+        search = match_pixels if network.recorder is None else RecordedMatching(network.recorder)
+        matcher, most = (lambda *given: FoundPixels(*search(*given))), 24  # a pair takes 46 MB at 512 x 384
+    options: dict[str, Any] = {"remembered_pairs": most, "depth_sigma_ratio": c.depth_sigma_ratio}
+    provider = Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, **options)
+    note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, {execution}, working image {width}x{height}"
     places = PlaceIndex(provider.place_descriptor)
-    return Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)
+    parts = Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)
+    parts.pairs_ahead = device != "cpu"  # there the main loop needs the processor itself
+    return parts
 
 
 def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:

@@ -34,6 +34,7 @@ from .second_pass import SecondPass, second_pass
 from .slam import Slam
 from .sources import open_source
 from .types import Source, StaticCloud
+from .view_depth import own_depth_spread
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -155,7 +156,7 @@ class _Job:
     def _track(self) -> int:
         count = 0
         with self.reporter.stage("tracking", self.source.length, "frames") as bar:
-            for frame in self.tracked.frames():
+            for frame in self.slam.parts.frames_ahead(self.tracked.frames(), self.slam.near):
                 self.slam.step(frame)
                 count += 1
                 bar.advance()
@@ -174,6 +175,9 @@ class _Job:
                 f"pointmaps {provider.name}: no depth was measured, no frame could be followed; every frame is given "
                 "one pose, and neither path, cloud nor map mean anything"
             )
+        assumed, found = provider.depth_sigma_ratio, own_depth_spread(self.slam.graph)
+        if assumed is not None and found is not None:
+            self.folder.note(f"own depths differ from the solved ones by {found:.1%} (1 sigma), assumed {assumed:.1%}")
         self._final = final_frames(self.slam.graph)
         self._write_trajectory()
 

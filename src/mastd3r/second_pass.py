@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -19,7 +20,7 @@ from .graph.keyframe_graph import KeyframeGraph
 from .lens_view import LensView
 from .parts import Parts
 from .rectify import Rectifier
-from .types import Frame, View
+from .types import Frame, View, WorkFrame
 from .view_depth import dynamics_input, static_at
 
 Array = NDArray[Any]
@@ -60,12 +61,22 @@ def second_pass(
     chosen = _view_positions(final, config)
     by_index = {f.record.index: f for f in final}
     waiting: list[int] = []  # keyframes without colours yet
-    for position, frame in enumerate(frames):
-        place = by_index.get(frame.index)
+    photographs: deque[Frame] = deque()
+
+    def tracked() -> Iterator[Frame]:
+        for photograph in frames:
+            photographs.append(photograph)
+            yield photograph if rectifier is None else rectifier.frame(photograph)
+
+    def near(seen: Frame) -> WorkFrame | None:
+        place = by_index.get(seen.index)
+        return None if place is None else graph.keyframes[place.record.kf_id].work
+
+    for position, seen in enumerate(parts.frames_ahead(tracked(), lambda: near)):
+        frame, place = photographs.popleft(), by_index.get(seen.index)
         if place is None:
             break
-        seen = frame if rectifier is None else rectifier.frame(frame)
-        work = parts.observe(seen, graph.keyframes[place.record.kf_id].work)
+        work = parts.observe(seen, near(seen))
         belief.prior(work.gray, work.semantic)
         given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0)
         mask = belief.update(given if parts.own_scale_known else _at_expected_scale(given))

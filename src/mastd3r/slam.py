@@ -18,8 +18,9 @@ from .graph.bundle import Lens
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
 from .graph.places import covisible, nearest_keyframe
 from .graph.submaps import join, scale_between
+from .lookahead import Beside, Later
 from .loops import close_loops, widen
-from .parts import Parts
+from .parts import Near, Parts
 from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
 from .types import Frame, Guess, State, WorkFrame
@@ -72,23 +73,30 @@ class Slam:
         self.graph.size = parts.size  # a run without a single keyframe still has a lens
         self.belief = DynamicBelief(config.dynamics, width, height)
         self.comparer = Comparer(config, parts, self.graph)
+        self._mask = Beside("mask")  # the belief lives in its thread: it is updated while the next frame is matched
         self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
         self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
         self._before_loss: Keyframe | None = None  # the same, when the camera was lost
         self._flow: Array | None = None  # ref -> last frame
-        self._last: tuple[WorkFrame, Array] | None = None  # last tracked frame and its P(moving)
+        self._last: tuple[WorkFrame, Later[Array]] | None = None  # last tracked frame and its P(moving)
         self._cam_from_ref = np.eye(4)  # of the last tracked frame
         self._most_matched = 0  # by any frame since ref was chosen
+
+    def near(self) -> Near:
+        """What the frame after the next is probably seen beside: the keyframe that is followed now."""
+        ref = self._ref
+        return lambda _: None if ref is None else ref.work
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
-        prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
+        prior = self._mask.later(lambda: grown(self.belief.prior(work.gray, work.semantic)))  # III-A, prior of (2)
         if self._ref is None:
             return self._start(work, prior, "first view")
-        kf, view = self._ref, self._find(work, prior)
+        view = self._find(work, prior)  # may change what is followed
+        kf = self._ref
         if view is None:
             kf, view = self._retry(work, prior)
         if view is None:
@@ -101,7 +109,7 @@ class Slam:
             kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
         return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
 
-    def _find(self, work: WorkFrame, prior: Array) -> TwoView | None:
+    def _find(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
         """The frame against the keyframe that is followed; a young submap first looks for the map that was lost."""
         assert self._ref is not None
         if not self.graph.initialised and self.graph.started:
@@ -111,7 +119,7 @@ class Slam:
         view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
         return view if self.comparer.believed(view) else None
 
-    def _rejoin(self, work: WorkFrame, prior: Array) -> TwoView | None:
+    def _rejoin(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
         graph = self.graph
         ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
@@ -129,7 +137,7 @@ class Slam:
                 return view
         return None
 
-    def _retry(self, work: WorkFrame, prior: Array) -> tuple[Keyframe, TwoView | None]:
+    def _retry(self, work: WorkFrame, prior: Later[Array]) -> tuple[Keyframe, TwoView | None]:
         """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
         assert self._ref is not None
         last, graph = self._last, self.graph
@@ -153,6 +161,8 @@ class Slam:
     def close(self) -> None:
         """After the last frame: keep what it alone sees, and join the submaps that can be."""
         graph = self.graph
+        if self._last is not None:
+            self._last[1].get()
         if self._last is not None and self._flow is not None and graph.initialised and self._ref is not None:
             work, moving = self._last
             view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
@@ -172,13 +182,13 @@ class Slam:
 
     # -- keyframes -------------------------------------------------------------------------------------------
 
-    def _start(self, work: WorkFrame, prior: Array, why: str) -> StepReport:
+    def _start(self, work: WorkFrame, prior: Later[Array], why: str) -> StepReport:
         graph = self.graph
         if not graph.started and not self.config.camera.intrinsics:
             graph.lens = started_at(graph.lens, work, graph.size)
         sigma = self.parts.provider.depth_sigma_ratio
         inv_depth, info = own_depth_prior(work, 1.0, sigma)
-        kf = graph.add_keyframe(work, static_at(prior, work.px), prior, np.eye(4), inv_depth, info)
+        kf = graph.add_keyframe(work, static_at(prior.get(), work.px), prior.get(), np.eye(4), inv_depth, info)
         graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
         graph.replace_last_by_keyframe(kf)
         if sigma is not None and bool((info * inv_depth**2 > 1).mean() > 0.1):
@@ -187,7 +197,7 @@ class Slam:
         self._last = (work, prior)
         return StepReport(work.index, work.timestamp_s, "started", kf.id, True, why)
 
-    def _start_again(self, work: WorkFrame, prior: Array) -> StepReport:
+    def _start_again(self, work: WorkFrame, prior: Later[Array]) -> StepReport:
         """The camera is lost: what follows is a submap of its own until it is recognised."""
         graph, ref = self.graph, self._ref
         why = "the view before it cannot be followed into it, and no keyframe looks like it"
@@ -208,7 +218,7 @@ class Slam:
         # something that passes in front thins the matches too, but from the same place nothing is gained
         return view.motion_ratio > enough or (thin and view.motion_ratio > 0.4 * enough)
 
-    def _changes_to_known(self, work: WorkFrame, moving: Array) -> bool:
+    def _changes_to_known(self, work: WorkFrame, moving: Later[Array]) -> bool:
         """Where an older keyframe sees the same from nearby, frames hang on that one, and nothing is added."""
         graph, ref, t = self.graph, self._ref, self.config.tracking
         assert ref is not None
@@ -229,24 +239,26 @@ class Slam:
         self._follow(kf, view, view.matched)
         return True
 
-    def _promote_last(self, work: WorkFrame, moving: Array) -> Keyframe:
+    def _promote_last(self, work: WorkFrame, moving: Later[Array]) -> Keyframe:
         assert self._ref is not None
         prior_view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
         return self._add_keyframe(work, moving, prior_view)
 
-    def _add_keyframe(self, work: WorkFrame, moving: Array, view: TwoView) -> Keyframe:
+    def _add_keyframe(self, work: WorkFrame, moving: Later[Array], view: TwoView) -> Keyframe:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
         graph, before = self.graph, self._ref
         assert before is not None
         cam_from_world = view.alignment.new_from_ref @ graph.blocks[before.id].cam_from_world
         sigma = self.parts.provider.depth_sigma_ratio
         inv_depth, info = predicted_depth(graph, before.id, cam_from_world, work, view.alignment.scale, sigma)
-        kf = graph.add_keyframe(work, static_at(moving, work.px), moving, cam_from_world, inv_depth, info)
+        mask = moving.get()
+        kf = graph.add_keyframe(work, static_at(mask, work.px), mask, cam_from_world, inv_depth, info)
         graph.replace_last_by_keyframe(kf)
-        graph.connect(before.id, kf.id, view.pair.matches, static_at(moving, view.pair.matches.new_px))
+        graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px))
         self._chain[before.id, kf.id] = view.pair.flow
         self._connect(kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
         recent = [k for k in graph.members()[-2 - self.config.graph.neighbours : -1] if k != before.id]
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before.id, *reversed(recent))])
         for k in reversed(recent):
             self._connect_both(k, kf.id)
         self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
@@ -261,7 +273,9 @@ class Slam:
     def _extend(self, kf: Keyframe, recent_from: int) -> None:
         """Older keyframes that see the same place, the window, and now and then everything."""
         graph, c = self.graph, self.config.graph
-        for k in covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio):
+        older = covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio)
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
+        for k in older:
             self._connect_both(k, kf.id)
         graph.solve_window()
         joined = len(graph.started) > 1 and self._joins(kf)
@@ -274,7 +288,7 @@ class Slam:
         own = graph.submap_of[kf.id]
         others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
         for other in self.parts.places.best(graph, kf.work, others):
-            view = self.comparer.recognised(other, kf.work, kf.moving / 255.0)
+            view = self.comparer.recognised(other, kf.work, Later.known(kf.moving / 255.0))
             if view is None:
                 continue
             pose = view.alignment.new_from_ref
@@ -309,12 +323,12 @@ class Slam:
             self._chain[i, j] = pair.flow
         return self.graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
 
-    def _update_belief(self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Array) -> Array:
+    def _update_belief(self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Later[Array]) -> Later[Array]:
         if not self.graph.initialised:
             return prior
         cam_from_world = view.alignment.new_from_ref @ self.graph.blocks[kf.id].cam_from_world
         given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
-        return grown(self.belief.update(given).probability)
+        return self._mask.later(lambda: grown(self.belief.update(given).probability))
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
         """Nothing can be seen: the frame has no place, and the next one is looked for where the last one was."""

@@ -54,6 +54,28 @@ def own_depth_prior(work: WorkFrame, scale: float, sigma_ratio: float | None) ->
     return inv_depth, info
 
 
+def own_depth_spread(graph: KeyframeGraph) -> float | None:
+    """Relative 1-sigma of the keyframes' own depths against the solved ones; None where fewer than 200 can tell.
+
+    Only depths that matches alone fix to 5 % (one pixel of noise) are compared. A solved depth leans on the own one as
+    much as its prior weighs: that is undone. Each frame's own scale is taken out, and the spread is that of the median
+    deviation: what ``depth_sigma_ratio`` of a provider should be.
+    """
+    found = []
+    for kf in graph.keyframes:
+        block = graph.blocks[kf.id]
+        if kf.work.own_inv_depth is None or len(block.depth_info) == 0:
+            continue
+        own = sample_own(kf.work, block.px)
+        sure = (own > 0) & (block.inv_depth > 0) & (block.depth_info * block.inv_depth**2 > 1 / 0.05**2)
+        if sure.sum() >= 20:
+            ratio = np.log(own[sure] / block.inv_depth[sure])
+            leaning = 1 + block.prior_info[sure] / block.depth_info[sure]
+            found.append(leaning * np.abs(ratio - np.median(ratio)))
+    away = np.concatenate(found) if found else np.zeros(0)
+    return 1.4826 * float(np.median(away)) if len(away) >= 200 else None
+
+
 def predicted_depth(
     graph: KeyframeGraph,
     kf_id: int,

@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..geometry.gauss_newton import damped_solve
+from ..geometry.point_system import point_system
 from ..geometry.reprojection import pose_system
 from ..geometry.se3 import se3_exp, transform
 from .reproject import PoseReport, StaticMatches
 
 Array = NDArray[Any]
+STALE_SIGMA = 0.1  # a nearest neighbour is believed to stay the nearest until points moved by this share of a sigma
 
 
 @dataclass(frozen=True)
@@ -33,22 +35,10 @@ def point_terms(moved: Array, own: Array, weight: Array, sigma: Array) -> tuple[
     Tangent: left perturbation of new_from_ref (translation, rotation), log-scale of ``own``. ``own`` holds the
     scaled points, so d own / d log s = own. Residual r = own - moved, J = d(moved - own).
     """
-    residual = (own - moved) / sigma[:, None]
-    squared = (residual**2).sum(1)
-    w = weight / (1 + squared / 4.0)
-    n = len(moved)
-    jac = np.zeros((n, 3, 7))
-    jac[:, 0, 0] = jac[:, 1, 1] = jac[:, 2, 2] = 1.0
-    x, y, z = moved.T
-    jac[:, 0, 4], jac[:, 0, 5] = z, -y
-    jac[:, 1, 3], jac[:, 1, 5] = -z, x
-    jac[:, 2, 3], jac[:, 2, 4] = y, -x
-    jac[:, :, 6] = -own
-    jac /= sigma[:, None, None]
-    flat, flat_w = jac.reshape(-1, 7), np.repeat(w, 3)
-    hess = (flat * flat_w[:, None]).T @ flat
-    rhs = (flat * flat_w[:, None]).T @ residual.reshape(-1)
-    return hess, rhs, float((weight * 4.0 * np.log1p(squared / 4.0)).sum())
+    found: tuple[Array, Array, float] = point_system(
+        *(np.ascontiguousarray(v, float) for v in (moved, own, weight, sigma))
+    )
+    return found
 
 
 def chamfer_pairs(moved: Array, own: Array) -> tuple[Array, Array]:
@@ -56,6 +46,24 @@ def chamfer_pairs(moved: Array, own: Array) -> tuple[Array, Array]:
     forward = cKDTree(own).query(moved)[1]
     backward = cKDTree(moved).query(own)[1]
     return np.r_[np.arange(len(moved)), backward], np.r_[forward, np.arange(len(own))]
+
+
+class _Neighbours:
+    """The pairs of E_cham, searched again where a point has moved by ``STALE_SIGMA`` of its own sigma since."""
+
+    def __init__(self) -> None:
+        self._moved: Array | None = None
+        self._own = np.zeros(0)
+        self._pairs = (np.zeros(0, int), np.zeros(0, int))
+
+    def of(self, moved: Array, own: Array, sigma: Array) -> tuple[Array, Array]:
+        """Pairs of two clouds (n, 3), row by row those of the last call, but a little moved."""
+        if self._moved is not None:
+            away = np.abs(moved - self._moved).max(1) + np.abs(own - self._own).max(1)
+            if (away < STALE_SIGMA * sigma).all():
+                return self._pairs
+        self._moved, self._own, self._pairs = moved, own, chamfer_pairs(moved, own)
+        return self._pairs
 
 
 def align_fine(
@@ -74,13 +82,14 @@ def align_fine(
     """
     pose, damping, converged, done = new_from_ref, 1e-4, False, 0
     log_scale = float(np.log(scale))
-    state = _system(matches, own, pose, log_scale, chamfer_weight, kernel_px)
+    near = _Neighbours()
+    state = _system(matches, own, pose, log_scale, chamfer_weight, kernel_px, near)
     for done in range(1, iterations + 1):
         step = damped_solve(state[0], state[1], damping)
         if step is None or damping > 1e4:
             break
         trial_pose, trial_log = se3_exp(step[:6]) @ pose, log_scale + float(step[6])
-        trial = _system(matches, own, trial_pose, trial_log, chamfer_weight, kernel_px)
+        trial = _system(matches, own, trial_pose, trial_log, chamfer_weight, kernel_px, near)
         if trial[2] > state[2] * (1 + 1e-9):
             damping *= 10
             continue
@@ -99,6 +108,7 @@ def _system(
     log_scale: float,
     chamfer_weight: float,
     kernel_px: float,
+    near: _Neighbours,
 ) -> tuple[Array, Array, float]:
     hess, rhs = np.zeros((7, 7)), np.zeros(7)
     hess[:6, :6], rhs[:6], cost = pose_system(
@@ -118,7 +128,7 @@ def _system(
     sigma = own.sigma_ratio * np.maximum(scaled[:, 2], 1e-6)
     parts = [point_terms(moved, scaled, w, sigma)]
     if chamfer_weight > 0 and used.sum() > 10:
-        i, j = chamfer_pairs(moved, scaled)
+        i, j = near.of(moved, scaled, sigma)
         parts.append(point_terms(moved[i], scaled[j], chamfer_weight * np.minimum(w[i], w[j]), sigma[j]))
     for h, b, c in parts:
         hess, rhs, cost = hess + h, rhs + b, cost + c

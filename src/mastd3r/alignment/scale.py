@@ -20,12 +20,18 @@ def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array,
     Returns 1.0 where no patch has ``min_points`` weighted points.
     """
     used = (weight > 0.05) & (depth_pre > 0) & (depth_new > 0)
-    ratios = []
-    for k in np.unique(patch[used]):
-        here = used & (patch == k)
-        if here.sum() >= min_points:
-            ratios.append(np.median(depth_pre[here]) / np.median(depth_new[here]))
-    return float(np.median(ratios)) if ratios else 1.0
+    _, patch = np.unique(patch[used], return_inverse=True)
+    count = np.bincount(patch)
+    many = count >= min_points
+    ratio = _medians(depth_pre[used], patch, count)[many] / _medians(depth_new[used], patch, count)[many]
+    return float(np.median(ratio)) if len(ratio) else 1.0
+
+
+def _medians(values: Array, patch: Array, count: Array) -> Array:
+    """(k,) median of the values (n,) of each patch 0 … k - 1; ``count`` (k,) says how many each has."""
+    ordered = values[np.lexsort((values, patch))]
+    first = np.cumsum(count) - count
+    return np.asarray((ordered[first + (count - 1) // 2] + ordered[first + count // 2]) / 2)
 
 
 def correct_scale(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,6 +46,7 @@ class DynamicBelief:
         self._past: deque[Past] = deque(maxlen=max(config.gaps, default=1))
         self._belief: Array | None = None  # log-odds of the evidence at half size, without the semantic prior
         self._arrival: _Arrival | None = None
+        self._beside = ThreadPoolExecutor(1, "depth")
 
     def prior(self, gray: Array, semantic: Array | None = None) -> Array:
         """P(moving) (h, w) float32 before the pose is known: the last posterior along the flow, and the semantics.
@@ -89,6 +91,9 @@ class DynamicBelief:
         fresh = np.zeros((self._h, self._w), np.float32)
         carried = arrival.carried
         terms: dict[str, Array] = {}
+        depth = None
+        if self.config.use_depth and given.own_inv_depth is not None:
+            depth = self._beside.submit(lambda: self._shrink(depth_log_ratio(given, self.config)))
         gaps = sorted({min(g, len(self._past)) for g in self.config.gaps} - {0})
         if self.config.use_motion and gaps:
             static = 1 - _sigmoid(carried)
@@ -98,8 +103,8 @@ class DynamicBelief:
                 carried = self._carry(
                     arrival.gray, found[0].flow, arrival.texture
                 )  # a better flow than the one prior() had
-        if self.config.use_depth and given.own_inv_depth is not None:
-            terms["depth"] = self._shrink(depth_log_ratio(given, self.config))
+        if depth is not None:
+            terms["depth"] = depth.result()
             # a thing where the map has nothing is no part of the map, also while it stands still
             doubt = np.clip(1 - terms["depth"], 0, 1)
             fresh = np.maximum(fresh, 0) + doubt * np.minimum(fresh, 0) + terms["depth"]

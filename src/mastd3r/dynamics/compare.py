@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -55,6 +56,7 @@ class MotionTest:
         self._flow = flow
         self._camera: Camera | None = None
         self._rays = np.zeros((3, height, width), np.float32)
+        self._others = ThreadPoolExecutor(max(len(config.gaps) - 1, 1), "mask")
 
     def compare(
         self, given: DynamicsInput, small: Array, texture: Information, static: Array, past: Sequence[Past]
@@ -64,7 +66,12 @@ class MotionTest:
         self._lens(given.camera)
         cov = flow_covariance(texture, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
         noise = photo_variance(texture, self.config)
-        return [self._one(given, small, static, p, (inv_depth, sigma), cov, noise) for p in past]
+
+        def one(earlier: Past) -> Comparison:
+            return self._one(given, small, static, earlier, (inv_depth, sigma), cov, noise)
+
+        beside = [self._others.submit(one, p) for p in past[1:]]
+        return [*(one(p) for p in past[:1]), *(job.result() for job in beside)]
 
     def _one(
         self,

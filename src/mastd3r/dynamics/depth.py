@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,14 +25,25 @@ def depth_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
     """
     if given.own_inv_depth is None:
         return np.zeros(given.gray.shape, np.float32)
-    own, background = given.own_inv_depth, given.inv_depth
-    known = (own > 0) & (background > 0) & np.isfinite(given.inv_depth_sigma)
-    own, background = np.where(known, own, 1.0), np.where(known, background, 1.0)
-    nearer = np.log(own / background)  # > 0: in front
-    spread = np.where(known, given.inv_depth_sigma, 0.0) / background
-    sigma = np.sqrt(spread**2 + config.depth_noise_ratio**2)
-    static = np.exp(-0.5 * (nearer / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    broad = np.where(nearer > 0, _FRONT, _BEHIND) / _SPAN
-    still, wrong = config.still_share, config.outlier_share
-    ratio = np.log(still * static + (1 - still) * broad) - np.log((1 - wrong) * static + wrong * 0.5 / _SPAN)
-    return np.where(known, ratio, 0.0).astype(np.float32)
+    maps = (given.own_inv_depth, given.inv_depth, given.inv_depth_sigma)
+    flat = (np.ascontiguousarray(m, np.float32).reshape(-1) for m in maps)
+    shares = config.depth_noise_ratio, config.still_share, config.outlier_share
+    ratio: Array = _log_ratio(*flat, *shares)
+    return ratio.reshape(given.gray.shape)
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _log_ratio(
+    own: Array, background: Array, background_sigma: Array, noise_ratio: float, still_share: float, wrong_share: float
+) -> Array:
+    out = np.zeros(len(own), np.float32)
+    for n in range(len(own)):
+        if not (own[n] > 0 and background[n] > 0 and math.isfinite(background_sigma[n])):
+            continue
+        nearer = math.log(own[n] / background[n])  # > 0: in front
+        sigma = math.sqrt((background_sigma[n] / background[n]) ** 2 + noise_ratio**2)
+        static = math.exp(-0.5 * (nearer / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
+        broad = (_FRONT if nearer > 0 else _BEHIND) / _SPAN
+        moving = still_share * static + (1 - still_share) * broad
+        out[n] = math.log(moving) - math.log((1 - wrong_share) * static + wrong_share * 0.5 / _SPAN)
+    return out

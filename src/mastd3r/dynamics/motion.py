@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,7 @@ from ..geometry.camera import Camera
 from .config import DynamicsConfig
 
 Array = NDArray[Any]
+_UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 squares
 Information = tuple[Array, Array, Array]  # xx, xy, yy, each (h, w) px^-2
 
 
@@ -93,14 +96,6 @@ def flow_covariance(information: Information, base_px: float, widest_px: float) 
     return cv2.merge([yy / det + base_px**2, -xy / det, xx / det + base_px**2])
 
 
-def _log_normal(residual: Array, cov: Array, extra: float) -> Array:
-    xx, xy, yy = cov[..., 0] + extra, cov[..., 1], cov[..., 2] + extra
-    det = np.maximum(xx * yy - xy * xy, 1e-12)
-    rx, ry = residual[..., 0], residual[..., 1]
-    mahalanobis = (yy * rx * rx - 2 * xy * rx * ry + xx * ry * ry) / det
-    return -0.5 * (mahalanobis + np.log(det))
-
-
 def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Array:
     """log p(residual | moving) - log p(residual | static), (h, w) float32.
 
@@ -108,20 +103,35 @@ def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Arr
     that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
     where a number is not finite.
     """
-    known: Array = np.asarray(np.isfinite(residual).all(-1) & np.isfinite(cov).all(-1))
-    residual = np.clip(np.where(known[..., None], residual, 0), -_UNKNOWN_PX, _UNKNOWN_PX).astype(float)
-    cov = np.where(known[..., None], cov, 1.0).astype(float)  # squares of a lost pixel's numbers leave float32
-    still = _log_normal(residual, cov, 0.0)
-    wide = _log_normal(residual, cov, config.motion_spread_px**2)
-    top = np.maximum(still, wide)
-    a, b = np.exp(still - top), np.exp(wide - top)
-    moving = config.still_share * a + (1 - config.still_share) * b
-    static = (1 - config.outlier_share) * a + config.outlier_share * b
-    ratio: Array = np.where(known, np.log(moving) - np.log(static), 0).astype(np.float32)
-    return ratio
+    flat = residual.reshape(-1, 2), cov.reshape(-1, 3)
+    given = (np.ascontiguousarray(v, np.float32) for v in flat)
+    ratio: Array = _log_ratio(*given, config.motion_spread_px**2, config.still_share, config.outlier_share)
+    return ratio.reshape(residual.shape[:-1])
 
 
-_UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 squares
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _log_normal(rx: float, ry: float, xx: float, xy: float, yy: float) -> float:
+    det = max(xx * yy - xy * xy, 1e-12)
+    return -0.5 * ((yy * rx * rx - 2 * xy * rx * ry + xx * ry * ry) / det + math.log(det))
+
+
+@nb.njit(cache=True, error_model="numpy", nogil=True)
+def _log_ratio(residual: Array, cov: Array, spread: float, still_share: float, outlier_share: float) -> Array:
+    out = np.zeros(len(residual), np.float32)
+    for n in range(len(residual)):
+        rx, ry = float(residual[n, 0]), float(residual[n, 1])
+        xx, xy, yy = float(cov[n, 0]), float(cov[n, 1]), float(cov[n, 2])  # squares of a lost pixel's leave float32
+        if not math.isfinite(rx + ry + xx + xy + yy):
+            continue
+        rx, ry = min(max(rx, -_UNKNOWN_PX), _UNKNOWN_PX), min(max(ry, -_UNKNOWN_PX), _UNKNOWN_PX)
+        still = _log_normal(rx, ry, xx, xy, yy)
+        wide = _log_normal(rx, ry, xx + spread, xy, yy + spread)
+        top = max(still, wide)
+        a, b = math.exp(still - top), math.exp(wide - top)
+        moving = still_share * a + (1 - still_share) * b
+        static = (1 - outlier_share) * a + outlier_share * b
+        out[n] = math.log(moving) - math.log(static)
+    return out
 
 
 def along_epipolar(cov: Array, slope: Array, inv_depth_sigma: Array) -> Array:

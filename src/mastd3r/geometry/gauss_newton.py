@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dposv
 
 Array = NDArray[Any]
 
@@ -21,10 +21,7 @@ def damped_solve(hess: Array, rhs: Array, damping: float) -> Array | None:
     step = np.zeros_like(rhs)
     if not used.any():
         return step
-    system = hess[np.ix_(used, used)].copy()
+    system = hess.copy() if used.all() else hess[np.ix_(used, used)]
     system[np.diag_indices_from(system)] += damping * diagonal[used] + 1e-8
-    try:
-        step[used] = cho_solve(cho_factor(system, lower=True), rhs[used])
-    except (np.linalg.LinAlgError, ValueError):
-        return None
-    return step if np.isfinite(step).all() else None
+    _, step[used], fault = dposv(system, rhs[used], lower=1)  # Cholesky, without the checks of its wrappers
+    return None if fault or not np.isfinite(step).all() else step

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
 from ..errors import InputError, MissingPackage
+from .products import products
 from .weights import path as weights_path
 
 Array = NDArray[Any]
@@ -84,7 +85,8 @@ class Dinov2Features:
         """
         ready = self.preprocess(pixels.to(self.device))
         rows, cols = ready.shape[2] // self.patch_px, ready.shape[3] // self.patch_px
-        hidden = self.model(pixel_values=ready.to(self.dtype)).last_hidden_state
+        with products(self.dtype):
+            hidden = self.model(pixel_values=ready.to(self.dtype)).last_hidden_state
         features = hidden[:, self.extra_tokens :].reshape(len(ready), rows, cols, -1).float()
         if not bool(torch.isfinite(features).all()):
             raise InputError(f"DINOv2 in {self.dtype}: expected finite features, got some that are not; use float32")

@@ -15,14 +15,16 @@ from .pair import PairNetwork
 SIZES = (Mast3rConfig.released(), Mast3rConfig.tiny())  # numbers of heads cannot be read from shapes
 
 
-def load_pair_network(path: Path, device: str, precision: str, long_side_px: int) -> PairNetwork:
+def load_pair_network(
+    path: Path, device: str, precision: str, long_side_px: int, execution: str = "eager"
+) -> PairNetwork:
     """MASt3R of released or tiny size from a file. Raises CheckpointError, MissingPackage, ConfigError."""
     state = read_state(path)
     with torch.device("meta"):
         model = Mast3r(size_of(state))
     model.load_state_dict(accounted_state(model, state, path), assign=True)
     del state
-    return PairNetwork(model.requires_grad_(False).eval(), device, precision, long_side_px=long_side_px)
+    return PairNetwork(model.requires_grad_(False).eval(), device, precision, execution, long_side_px)
 
 
 def size_of(state: Mapping[str, Tensor]) -> Mast3rConfig:

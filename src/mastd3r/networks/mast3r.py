@@ -9,7 +9,7 @@ positions are those of the grid as it is.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -132,16 +132,6 @@ class Mast3r(nn.Module):
         maps1, maps2 = self.decode_tokens(first.tokens, second.tokens, *ropes)
         return self.downstream_head1(maps1, *first.grid), self.downstream_head2(maps2, *second.grid)
 
-    def decode_symmetric(
-        self, a: Encoded, b: Encoded
-    ) -> tuple[tuple[HeadOutput, HeadOutput], tuple[HeadOutput, HeadOutput]]:
-        """((a, b in a's camera), (b, a in b's camera)): both orders, as one batch where the grids are equal."""
-        if a.grid != b.grid:
-            return self.decode(a, b), self.decode(b, a)
-        first, second = self.decode(stacked([a, b]), stacked([b, a]))
-        n = len(a)
-        return (_rows(first, 0, n), _rows(second, 0, n)), (_rows(first, n, 2 * n), _rows(second, n, 2 * n))
-
     def encode_tokens(self, images: Tensor, rope: RopeTable) -> Tensor:
         """The encoder on tensors alone: (b, 3, h, w) -> (b, n, c)."""
         x = self.patch_embed(images).float()
@@ -177,6 +167,18 @@ def _head(c: Mast3rConfig) -> Head:
     return Head(token_dims, c.dpt_layer_dims, c.dpt_channels, c.dpt_last, c.descriptor_dim, c.patch_px)
 
 
+Views = tuple[HeadOutput, HeadOutput]
+
+
+def in_both_orders(decode: Callable[[Encoded, Encoded], Views], a: Encoded, b: Encoded) -> tuple[Views, Views]:
+    """((a, b in a's camera), (b, a in b's camera)), as one batch where the grids are equal."""
+    if a.grid != b.grid:
+        return decode(a, b), decode(b, a)
+    first, second = decode(stacked([a, b]), stacked([b, a]))
+    n = len(a)
+    return (_rows(first, 0, n), _rows(second, 0, n)), (_rows(first, n, 2 * n), _rows(second, n, 2 * n))
+
+
 def _rows(out: HeadOutput, start: int, end: int) -> HeadOutput:
     return HeadOutput(
         out.points[start:end],
@@ -197,10 +199,7 @@ def random_mast3r(config: Mast3rConfig, seed: int = 0) -> Mast3r:
 
 
 def seeded_weights(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, Array]:
-    """Random float32 arrays that depend on a name, its shape and the seed only; doubled names get equal values.
-
-    Weights have variance 1 / fan-in, so that signals keep their size through the layers; scales of norms are near 1.
-    """
+    """Random float32 arrays that depend on a name, its shape and the seed only; doubled names get equal values."""
     made: dict[str, Array] = {}
     for name, shape in sorted(shapes.items()):
         source = name
@@ -209,17 +208,23 @@ def seeded_weights(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, A
         if source in made:
             made[name] = made[source]
             continue
+        mean, deviation = weight_law(source, shape)
         values = np.random.RandomState(zlib.crc32(source.encode()) ^ seed).standard_normal(shape).astype(np.float32)
-        if len(shape) > 1:
-            transposed = ".act_postprocess.0.1." in source or ".act_postprocess.1.1." in source
-            fan_in = shape[0] if transposed else int(np.prod(shape[1:]))
-            last = source.endswith(".dpt.head.4.weight")  # its outputs stand in an exponent
-            values *= fan_in**-0.5 * (0.2 if last else 1)
-        elif "norm" in source.split(".")[-2] and source.endswith(".weight"):
-            values = 1 + 0.1 * values
-        else:
-            values *= 0.1
-            if source.endswith(".dpt.head.4.bias"):
-                values[2] += 2.5  # points lie before the camera, not around its centre
-        made[name] = values.astype(np.float32)
+        made[name] = (mean + np.float32(deviation) * values).astype(np.float32)
     return made
+
+
+def weight_law(name: str, shape: tuple[int, ...]) -> tuple[Array, float]:
+    """Mean, to be broadcast, and deviation of a parameter's random values.
+
+    Weights have variance 1 / fan-in, so that signals keep their size through the layers; scales of norms are near 1.
+    """
+    if len(shape) > 1:
+        transposed = ".act_postprocess.0.1." in name or ".act_postprocess.1.1." in name
+        fan_in = shape[0] if transposed else int(np.prod(shape[1:]))
+        last = name.endswith(".dpt.head.4.weight")  # its outputs stand in an exponent
+        return np.zeros(1, np.float32), fan_in**-0.5 * (0.2 if last else 1)
+    if "norm" in name.split(".")[-2] and name.endswith(".weight"):
+        return np.ones(1, np.float32), 0.1
+    before = name.endswith(".dpt.head.4.bias")  # points lie before the camera, not around its centre
+    return np.array([0, 0, 2.5, 0] if before else [0], np.float32), 0.1

@@ -5,6 +5,8 @@ The twin of ``pointmap/matching.py``, which says what is searched and why; names
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,9 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from .record import Recorder
+
 Array = NDArray[Any]
 _SETTLED_PX = 1e-3
 _FLAT, _MOST_ALIKE = 1e-6, 1.1
+PADDED_TO = 512  # pixels asked for are padded to a multiple
 _ROWS_AT_ONCE = 1 << 15  # pixels in one block of the descriptor search: 49 descriptors each are gathered
 
 
@@ -53,6 +58,10 @@ class Options(Protocol):
     def reciprocal_px(self) -> float: ...
 
 
+Found = tuple[Array, Array, Array, Array]
+Maps6 = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # points, descriptors, confidence of target, of source
+
+
 @torch.inference_mode()
 def match_pixels(
     target: Maps,
@@ -61,44 +70,89 @@ def match_pixels(
     start_px: Array | None,
     options: Options,
     device: torch.device | str | None = None,
-) -> tuple[Array, Array, Array, Array]:
+) -> Found:
     """Find source pixels (n, 2) in the target view, from ``start_px`` (n, 2) there or from the same pixels.
 
     ``device`` defaults to that of target's points. Returns numpy (px (n, 2) float64, valid (n,) bool,
     confidence (n,) float64, likeness (n,) float64), the fields of ``pointmap.matching.FoundPixels`` in order.
     Raises ValueError where px lies outside the source view.
     """
-    points = _tensor(target.points, device)
-    device = points.device
-    h, w = source.points.shape[:2]
-    whole = np.round(np.asarray(px)).astype(np.int64)
-    if len(whole) and ((whole < 0).any() or (whole >= [w, h]).any()):
-        raise ValueError(f"match_pixels: expected pixels inside {w}x{h}, got {whole.min(0)}…{whole.max(0)}")
-    at = torch.as_tensor(whole, device=device)
-    x, y = at[:, 0], at[:, 1]
-    start = torch.as_tensor(np.asarray(px if start_px is None else start_px, np.float32), device=device)
-    wanted = _tensor(source.points, device)[y, x]
+    maps = _maps(target, source, device)
+    at, start = _asked(source, px, start_px, maps[0].device)
+    return _found(matched(options, *maps, at, start))
+
+
+class RecordedMatching:
+    """``match_pixels`` whose search is recorded: some thousand short kernels, played back as one launch."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._searches: dict[Options, Callable[..., Tensor]] = {}
+
+    @torch.inference_mode()
+    def __call__(self, target: Maps, source: Maps, px: Array, start_px: Array | None, options: Options) -> Found:
+        """As ``match_pixels``. The pixels are padded to whole steps, so that few shapes are recorded."""
+        maps = _maps(target, source, self._recorder.device)
+        at, start = _asked(source, px, start_px, self._recorder.device)
+        n = len(at)
+        more = -n % PADDED_TO
+        if options not in self._searches:
+            self._searches[options] = self._recorder.recorded(partial(matched, options))
+        padded = (functional.pad(values, (0, 0, 0, more)) for values in (at, start))
+        return _found(self._searches[options](*maps, *padded)[:n])
+
+
+def matched(
+    options: Options,
+    points: Tensor,
+    descriptors: Tensor,
+    sure: Tensor,
+    source_points: Tensor,
+    source_descriptors: Tensor,
+    source_sure: Tensor,
+    at: Tensor,
+    start: Tensor,
+) -> Tensor:
+    """The search on tensors alone: (n, 5) float64 x, y, valid, confidence, likeness of whole source pixels ``at``."""
+    x, y = at.unbind(1)
+    wanted = source_points[y, x]
     near, cost = search_rays(ray_image(points), wanted, start, options)
-    source_maps, target_maps = _tensor(source.descriptors, device), _tensor(target.descriptors, device)
-    found, likeness = search_descriptors(target_maps, source_maps[y, x], near, options)
+    found, likeness = search_descriptors(descriptors, source_descriptors[y, x], near, options)
     tx, ty = found.round().long().unbind(1)
     nx, ny = near.round().long().unbind(1)
     valid = (cost < options.converged) & (likeness > -1)
     for there in (points[ny, nx], points[ty, tx]):
         valid &= same_place(there, wanted, options.distance_ratio)
-    sure, sure_too = _tensor(target.descriptor_confidence, device), _tensor(source.descriptor_confidence, device)
-    ends = torch.stack([sure[ty, tx], sure_too[y, x]])
+    ends = torch.stack([sure[ty, tx], source_sure[y, x]])
     confidence = torch.where(torch.isfinite(ends) & (ends > 0), ends, 0.0).sqrt().prod(0)
     valid &= confidence > options.min_descriptor_confidence
     if options.reciprocal_px > 0:
-        back, _ = search_descriptors(source_maps, target_maps[ty, tx], at.float(), options)
+        back, _ = search_descriptors(source_descriptors, descriptors[ty, tx], at.float(), options)
         valid &= (back - at).norm(dim=1) <= options.reciprocal_px
-    return (
-        found.double().cpu().numpy(),
-        valid.cpu().numpy(),
-        confidence.double().cpu().numpy(),
-        likeness.double().cpu().numpy(),
-    )
+    rest = torch.stack([valid.double(), confidence.double(), likeness.double()], 1)
+    return torch.cat([found.double(), rest], 1)
+
+
+def _maps(target: Maps, source: Maps, device: torch.device | str | None) -> Maps6:
+    first = _tensor(target.points, device)
+    rest = (target.descriptors, target.descriptor_confidence, source.points, source.descriptors)
+    a, b, c, d = (_tensor(values, first.device) for values in rest)
+    return first, a, b, c, d, _tensor(source.descriptor_confidence, first.device)
+
+
+def _asked(source: Maps, px: Array, start_px: Array | None, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Whole source pixels (n, 2) int64 and starts (n, 2) float32, on the device. Raises ValueError."""
+    h, w = source.points.shape[:2]
+    whole = np.round(np.asarray(px)).astype(np.int64).reshape(-1, 2)
+    if len(whole) and ((whole < 0).any() or (whole >= [w, h]).any()):
+        raise ValueError(f"match_pixels: expected pixels inside {w}x{h}, got {whole.min(0)}…{whole.max(0)}")
+    start = np.asarray(px if start_px is None else start_px, np.float32).reshape(-1, 2)
+    return torch.from_numpy(whole).to(device), torch.from_numpy(start).to(device)
+
+
+def _found(values: Tensor) -> Found:
+    out = values.cpu().numpy()
+    return out[:, :2], out[:, 2] > 0, out[:, 3], out[:, 4]
 
 
 def _tensor(values: Any, device: torch.device | str | None) -> Tensor:
@@ -137,6 +191,11 @@ def _sample(image: Tensor, px: Tensor) -> Tensor:
     return upper * (1 - b)[:, None] + lower * b[:, None]
 
 
+def _clamped(px: Tensor, low: int, high_x: int, high_y: int) -> Tensor:
+    """(n, 2) pixels held inside; plain numbers, since a recording cannot bring arrays to the device."""
+    return torch.stack([px[:, 0].clamp(low, high_x), px[:, 1].clamp(low, high_y)], 1)
+
+
 def _difference(sampled: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit rays (n, 3), their lengths before (n, 1), squared differences (n,), inf where there is no ray."""
     length = sampled[:, :3].norm(dim=1, keepdim=True)
@@ -161,15 +220,13 @@ def search_rays(image: Tensor, points: Tensor, start_px: Tensor, options: Option
     known = torch.isfinite(length) & (length > 0)
     rays = (torch.where(known, points, 0.0) / torch.where(known, length, 1.0)).double()
     image, h, w = image.double(), image.shape[0], image.shape[1]
-    high = torch.tensor([w - 2.0, h - 2.0], device=image.device, dtype=torch.float64)
-    low = torch.ones_like(high)
-    px = torch.where(torch.isfinite(start_px), start_px, 0.0).double().clamp(low, high)
+    px = _clamped(torch.where(torch.isfinite(start_px), start_px, 0.0).double(), 1, w - 2, h - 2)
     sampled = _sample(image, px)
     unit, size, cost = _difference(sampled, rays)
     damping = torch.full_like(cost, options.damping)
     active = torch.isfinite(cost)
     for _ in range(options.iterations):
-        trial_px = (px - _step(sampled, unit, size, rays, damping)).clamp(low, high)
+        trial_px = _clamped(px - _step(sampled, unit, size, rays, damping), 1, w - 2, h - 2)
         sound = torch.isfinite(trial_px).all(1)
         trial_px = torch.where(sound[:, None], trial_px, px)
         trial_sampled = _sample(image, trial_px)
@@ -197,8 +254,7 @@ def search_descriptors(
 
 def _search_block(maps: Tensor, wanted: Tensor, start_px: Tensor, options: Options) -> tuple[Tensor, Tensor]:
     h, w = maps.shape[:2]
-    high = torch.tensor([w - 1, h - 1], device=maps.device)
-    at = start_px.round().long().clamp(torch.zeros_like(high), high)
+    at = _clamped(start_px.round().long(), 0, w - 1, h - 1)
     one_way = torch.arange(-options.radius, options.radius + 1, device=maps.device)
     offsets = torch.cartesian_prod(one_way, one_way).flip(1)  # row by row
     middle = len(offsets) // 2

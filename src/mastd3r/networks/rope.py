@@ -6,7 +6,7 @@ Rotary embedding: Su et al. 2021. Two dimensions, base 100 and integer (y, x) po
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -22,7 +22,7 @@ class RopeTable:
     sin: Tensor
 
 
-@lru_cache(maxsize=16)
+@cache  # small; and recorded layers read them for ever
 def rope_table(rows: int, cols: int, head_dim: int, device: torch.device) -> RopeTable:
     """Angles of a grid of rows x cols tokens, row by row. Raises ValueError where head_dim is no multiple of 4."""
     if head_dim % 4:

@@ -180,7 +180,7 @@ def _hub_files(hub_id: str, revision: str) -> list[KnownFile]:
         raise InputError(f"{hub()}/{hub_id}: expected a list of files, got something else ({e})") from e
     finally:
         listing.unlink(missing_ok=True)
-    return [f for f in files if "/" not in f.name]
+    return [f for f in files if not set("/\\") & set(f.name)]
 
 
 def _agree(licence: Licence, accept: Accept) -> None:

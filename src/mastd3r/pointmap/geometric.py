@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.camera import Camera
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
+from .base import Observing
 from .flow import FlowMatcher, corner_grid
 
 Array = NDArray[Any]
@@ -24,18 +26,19 @@ def working_size(width: int, height: int, area_px: int) -> tuple[int, int]:
     return max(16, round(width * scale)), max(16, round(height * scale))
 
 
-class GeometricPointmaps:
+class GeometricPointmaps(Observing):
     """Provider that needs no weights and no depth sensor."""
 
     name = "geometric"
     depth_sigma_ratio: float | None = None
+    finds_far = False
 
     def __init__(self, width: int, height: int, cell_px: int) -> None:
         self.width, self.height, self.cell_px = width, height, cell_px
         self.flow = FlowMatcher(width, height)
 
-    def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
-        """Shrink to working size and choose the pixels that will be matched; ``near`` is not needed."""
+    def look(self, frame: Frame) -> WorkFrame:
+        """Shrink to working size and choose the pixels that will be matched."""
         gray = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
         gray = cv2.resize(gray, (self.width, self.height), interpolation=cv2.INTER_AREA)
         px, strength = corner_grid(gray, self.cell_px)
@@ -49,6 +52,13 @@ class GeometricPointmaps:
 
     def _own_inv_depth(self, frame: Frame) -> Array | None:
         return None
+
+    def beside(self, work: WorkFrame, near: WorkFrame | None) -> WorkFrame:
+        """The frame as it is: all that is known of it is known alone."""
+        return work
+
+    def expect(self, pairs: Sequence[tuple[WorkFrame, WorkFrame]]) -> None:
+        """Nothing to prepare."""
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
         """Match ref's pixels in new; points by ref's depth where it is known, by triangulation otherwise."""

@@ -8,7 +8,7 @@ Pairs. ``predict(ref, new)`` decodes new as FIRST view, as MASt3R-SLAM does in t
 in new's camera, from which ref's pixels are found in new. One decode a pair; the other order is ``predict(new, ref)``.
 
 Own depth. A frame's depth is the z of its first decode as first view: with itself, or with the frame named ``near``
-in ``observe``, whose pair is then ready for ``predict`` and costs nothing more. Points of ref and of new are always
+in ``beside``, whose pair is then ready for ``predict`` and costs nothing more. Points of ref and of new are always
 this depth along the given camera's rays, so ``own_inv_depth`` and both pointmaps are of one mould and ICP, scale and
 re-mapping see one lens. Every frame has its own scale: that is what eq. (9) finds.
 """
@@ -17,8 +17,9 @@ from __future__ import annotations
 
 import itertools
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, fields, replace
+from threading import Lock, RLock
 from typing import Any, Generic, Protocol, TypeVar
 
 import cv2
@@ -29,30 +30,16 @@ from ..errors import InputError
 from ..geometry.camera import Camera
 from ..geometry.sim3 import Sim3, procrustes
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
+from .base import Observing
 from .geometric import GeometricPointmaps
 from .matching import FoundPixels, MatchOptions, ViewMaps, match_pixels, subsampled
+from .network_view import Window, as_array, corner_of, focal_from_points, in_window, own_inv_depth, sample_smooth
 
 Array = NDArray[Any]
 T = TypeVar("T")
 FLOW_STEP_PX = 8  # the dense flow is matched at one pixel of 8 x 8, and interpolated
-MIN_CONFIDENCE = 1.5  # of a point, in the network's own 1 … inf, for it to count as own depth
-EDGE_RATIO = 1.05  # inverse depths of neighbours that differ by more belong to two surfaces
+SPARE_PAIRS = 2  # of those remembered: what the frames ahead bring in
 HALF_WEIGHT = 1.5  # descriptor confidence at which a match weighs one half
-MAX_INV_DEPTH = 1e4  # nearer than 0.1 mm is not a measurement
-MIN_INV_DEPTH = 1e-4  # farther than 10 km neither
-
-
-class Window(Protocol):
-    """Where the network's image lies in the photograph at the network's scale."""
-
-    @property
-    def resized_size(self) -> tuple[int, int]: ...  # (width, height) of the whole photograph at that scale
-    @property
-    def crop_left_px(self) -> int: ...
-    @property
-    def crop_top_px(self) -> int: ...
-    @property
-    def net_size(self) -> tuple[int, int]: ...  # (width, height) of what the network sees
 
 
 class TwoViewNetwork(Protocol):
@@ -60,7 +47,9 @@ class TwoViewNetwork(Protocol):
 
     def prepare(self, image: Array) -> Any: ...  # (H, W, 3) uint8 RGB -> has .mapping, a Window
     def encode(self, prepared: Any) -> Any: ...  # -> has .pooled, (c,) numpy: the mean token
-    def pair(self, a: Any, b: Any) -> Any: ...  # two encoded -> has .first, .second: ViewMaps, arrays or tensors
+    def pairs(self, pairs: Sequence[tuple[Any, Any]]) -> Sequence[Any]: ...
+
+    # of two encoded each -> each has .first, .second: ViewMaps, arrays or tensors; all of one size
 
 
 Matcher = Callable[[ViewMaps, ViewMaps, Array, "Array | None", MatchOptions], FoundPixels]
@@ -87,20 +76,15 @@ class _HostMaps:
 
     @property
     def points(self) -> Array:
-        return _array(self._maps.points)
+        return as_array(self._maps.points)
 
     @property
     def descriptors(self) -> Array:
-        return _array(self._maps.descriptors)
+        return as_array(self._maps.descriptors)
 
     @property
     def descriptor_confidence(self) -> Array:
-        return _array(self._maps.descriptor_confidence)
-
-
-def _array(values: Any) -> Array:
-    """A tensor of any device as numpy; an array as it is."""
-    return np.asarray(values.cpu() if hasattr(values, "cpu") else values)
+        return as_array(self._maps.descriptor_confidence)
 
 
 @dataclass(frozen=True)
@@ -113,12 +97,11 @@ class NetworkFrame(WorkFrame):
     focal_px: float | None  # the lens that its points speak of, at working size; None: they speak of none
 
 
-class Mast3rPointmaps:
-    """Provider over an injected network. Not safe for use from several threads: it remembers tokens and pairs."""
+class Mast3rPointmaps(Observing):
+    """Provider over an injected network. It remembers tokens and pairs; one thread at a time asks the network."""
 
     name = "mast3r"
-    # Chosen, not measured: errors of such depths are of this order after their scale is found, and are smooth.
-    depth_sigma_ratio: float | None = 0.08
+    finds_far = True  # the search on rays finds its way from the same pixel, without a start
 
     def __init__(
         self,
@@ -131,6 +114,7 @@ class Mast3rPointmaps:
         matcher: Matcher = match_on_host,
         remembered_frames: int = 48,
         remembered_pairs: int = 4,
+        depth_sigma_ratio: float = 0.08,
     ) -> None:
         """``width`` and ``height`` are those of ``working_size_of``; maps on a device want a matcher for them."""
         self.network, self.width, self.height, self.cell_px = network, width, height, cell_px
@@ -138,13 +122,13 @@ class Mast3rPointmaps:
         self._look = GeometricPointmaps(width, height, cell_px)
         self._encoded: _Remembered[Any] = _Remembered(remembered_frames)
         self._pairs: _Remembered[Any] = _Remembered(remembered_pairs)
+        self.depth_sigma_ratio: float | None = depth_sigma_ratio
         self._serial = itertools.count()
+        self._asking = RLock()
 
-    def observe(self, frame: Frame, near: WorkFrame | None = None) -> NetworkFrame:
-        """Working image, pixels to match, own depth.
+    def look(self, frame: Frame) -> NetworkFrame:
+        """Working image, pixels to match, and the network's tokens; no own depth yet.
 
-        ``near``: a frame that sees the same place (the keyframe that the next ``predict`` will name as ref); the own
-        depth then comes from the pair with it. Without it the frame is paired with itself: one more decode.
         Raises InputError where the frame's size does not give the provider's working size.
         """
         prepared = self.network.prepare(frame.image)
@@ -155,15 +139,34 @@ class Mast3rPointmaps:
                 f"frame {frame.index}: expected frames whose working size is {self.width}x{self.height}, "
                 f"got {w}x{h} pixels, which give {window.resized_size[0]}x{window.resized_size[1]}"
             )
-        seen = _fields(self._look.observe(frame))
-        new = NetworkFrame(**seen, prepared=prepared, window=window, serial=next(self._serial), focal_px=None)
+        seen = _fields(self._look.look(frame))
+        work = NetworkFrame(**seen, prepared=prepared, window=window, serial=next(self._serial), focal_px=None)
+        self._tokens(work)
+        return work
+
+    def beside(self, work: WorkFrame, near: WorkFrame | None) -> NetworkFrame:
+        """The frame with own depth and focal length, from its pair with ``near``.
+
+        ``near``: a frame that sees the same place (the keyframe that the next ``predict`` will name as ref). Without
+        it the frame is paired with itself: one more decode.
+        """
+        new = _network_frame(work)
+        window = new.window
         first = self._decoded(new, new if near is None else _network_frame(near)).first
-        points, confidence = _array(first.points), _array(first.confidence)
+        points, confidence = as_array(first.points), as_array(first.confidence)
         own = np.zeros((self.height, self.width), np.float32)
         in_window(own, window)[:] = own_inv_depth(points, confidence)
         centre = (self.width - 1) / 2 - window.crop_left_px, (self.height - 1) / 2 - window.crop_top_px
         focal = focal_from_points(points, in_window(own, window) > 0, centre)
         return replace(new, own_inv_depth=own, focal_px=focal)
+
+    def expect(self, pairs: Sequence[tuple[WorkFrame, WorkFrame]]) -> None:
+        """Decode both orders of these pairs in one pass, if they can all be remembered until they are asked for."""
+        orders = [(a, b) for pair in pairs for a, b in (pair, pair[::-1])]
+        frames = [(_network_frame(a), _network_frame(b)) for a, b in orders]
+        wanted = [p for p in frames if self._pairs.get(_serials(p)) is None]
+        if len(wanted) <= self._pairs.most - SPARE_PAIRS:
+            self._decode_all(wanted)
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
         """Ref's chosen pixels found in new, and both pointmaps in ref's camera, in the scale of guess.ref_inv_depth.
@@ -189,23 +192,35 @@ class Mast3rPointmaps:
     # -- the network, each thing once ------------------------------------------------------------------------
 
     def _tokens(self, frame: NetworkFrame) -> Any:
-        return self._encoded.get(frame.serial, lambda: self.network.encode(frame.prepared))
+        found = self._encoded.get(frame.serial)
+        if found is None:
+            with self._asking:
+                found = self._encoded.get(frame.serial) or self.network.encode(frame.prepared)
+                self._encoded.put(frame.serial, found)
+        return found
 
     def _decoded(self, first: NetworkFrame, second: NetworkFrame) -> Any:
-        def decode() -> Any:
-            return self.network.pair(self._tokens(first), self._tokens(second))
+        found = self._pairs.get((first.serial, second.serial))  # without waiting for what another thread asks
+        return found or self._decode_all([(first, second)])[0]
 
-        return self._pairs.get((first.serial, second.serial), decode)
+    def _decode_all(self, pairs: Sequence[tuple[NetworkFrame, NetworkFrame]]) -> Sequence[Any]:
+        if not pairs:
+            return []
+        with self._asking:
+            found = self.network.pairs([(self._tokens(a), self._tokens(b)) for a, b in pairs])
+            for pair, decoded in zip(pairs, found, strict=True):
+                self._pairs.put(_serials(pair), decoded)
+        return found
 
     def _matches(self, ref: NetworkFrame, new: NetworkFrame, pair: Any, start: Array | None) -> tuple[Matches, Array]:
         """Matches of ref's chosen pixels, and the dense flow ref -> new (h, w, 2) float32."""
-        offset, (w, h) = _corner(ref.window), ref.window.net_size
+        offset, (w, h) = corner_of(ref.window), ref.window.net_size
         chosen = np.round(ref.px) - offset
         inside = ((chosen >= 0) & (chosen < [w, h])).all(1)
         cells, grid = subsampled(h, w, FLOW_STEP_PX)
         at = np.concatenate([chosen[inside], cells])
         begin = at if start is None else at + _flow_at(start, at + offset)
-        shift = offset - _corner(new.window)  # 0 for frames of one size
+        shift = offset - corner_of(new.window)  # 0 for frames of one size
         found = self.matcher(pair.first, pair.second, at, begin + shift, self.options)
         moved, n = found.px - shift - at, int(inside.sum())
         flow = self._spread(moved[n:], found.valid[n:], grid, offset, start)
@@ -230,18 +245,27 @@ class Mast3rPointmaps:
 
 
 class _Remembered(Generic[T]):
-    """The values of the last few keys."""
+    """The values of the last few keys that were put or asked for."""
 
     def __init__(self, most: int) -> None:
-        self.most, self._values = most, OrderedDict[Hashable, T]()
+        self.most, self._values, self._lock = most, OrderedDict[Hashable, T](), Lock()
 
-    def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        if key not in self._values:
-            self._values[key] = make()
-        self._values.move_to_end(key)
-        while len(self._values) > self.most:
-            self._values.popitem(last=False)
-        return self._values[key]
+    def put(self, key: Hashable, value: T) -> None:
+        with self._lock:
+            self._values[key] = value
+            self._values.move_to_end(key)
+            while len(self._values) > self.most:
+                self._values.popitem(last=False)
+
+    def get(self, key: Hashable) -> T | None:
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+            return self._values.get(key)
+
+
+def _serials(pair: tuple[NetworkFrame, NetworkFrame]) -> tuple[int, int]:
+    return pair[0].serial, pair[1].serial
 
 
 def _fields(frame: WorkFrame) -> dict[str, Any]:
@@ -250,71 +274,15 @@ def _fields(frame: WorkFrame) -> dict[str, Any]:
 
 def _network_frame(frame: WorkFrame) -> NetworkFrame:
     if not isinstance(frame, NetworkFrame):
-        raise TypeError(f"Mast3rPointmaps: expected a frame of its own observe(), got {type(frame).__name__}")
+        raise TypeError(f"Mast3rPointmaps: expected a frame of its own look(), got {type(frame).__name__}")
     return frame
-
-
-def own_inv_depth(points: Array, confidence: Array) -> Array:
-    """(h, w) float32 1/z of a view's points in its own camera; 0 where they are unsure or nonsense."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        inv_depth = 1 / points[..., 2]
-    known = (inv_depth > MIN_INV_DEPTH) & (inv_depth < MAX_INV_DEPTH) & (confidence > MIN_CONFIDENCE)
-    known &= np.isfinite(points).all(-1)
-    return np.where(known, inv_depth, 0).astype(np.float32)
-
-
-def in_window(values: Array, window: Window) -> Array:
-    """The part of a working-size map (h, w, …) that the network sees; a view, not a copy."""
-    x, y, (w, h) = window.crop_left_px, window.crop_top_px, window.net_size
-    return values[y : y + h, x : x + w]
-
-
-def _corner(window: Window) -> Array:
-    return np.array([window.crop_left_px, window.crop_top_px], float)
-
-
-def focal_from_points(points: Array, known: Array, centre_px: tuple[float, float]) -> float | None:
-    """Focal length in px of a pointmap in its own camera (h, w, 3): median of u·q/|q|², u = px - centre, q = xy/z.
-
-    One pixel of 4 x 4 speaks, if off the centre by a tenth of the diagonal; None for fewer than 50 of them.
-    """
-    y, x = np.argwhere(known[::4, ::4]).T * 4
-    u = np.stack([x - centre_px[0], y - centre_px[1]], 1)
-    far = np.hypot(*u.T) > 0.1 * np.hypot(*known.shape)
-    at = points[y[far], x[far]].astype(float)
-    q, u = at[:, :2] / at[:, 2:], u[far]
-    along = (u * q).sum(1)
-    fine = along > 0
-    if fine.sum() < 50:
-        return None
-    return float(np.median(along[fine] / (q[fine] ** 2).sum(1)))
-
-
-def sample_smooth(inv_depth: Array | None, px: Array) -> Array:
-    """(p,) bilinear inverse depth; 0 where a corner is unknown or outside, or the corners are two surfaces.
-
-    Inverse depth, because that of a plane is linear in the pixel.
-    """
-    if inv_depth is None:
-        return np.zeros(len(px))
-    h, w = inv_depth.shape
-    inside = (px[:, 0] >= 0) & (px[:, 1] >= 0) & (px[:, 0] <= w - 1) & (px[:, 1] <= h - 1)
-    at = np.where(inside[:, None], px, 0.0)
-    x, y = np.minimum(at.astype(int), [max(w - 2, 0), max(h - 2, 0)]).T
-    a, b = at[:, 0] - x, at[:, 1] - y
-    corners = np.stack([inv_depth[y + j, x + i] for j in (0, 1) for i in (0, 1)]).astype(float)
-    share = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-    counts = share > 1e-9
-    low = np.where(counts, corners, np.inf).min(0)
-    high = np.where(counts, corners, 0.0).max(0)
-    return np.where(inside & (low > 0) & (high < EDGE_RATIO * low), (share * corners).sum(0), 0.0)
 
 
 def _at(confidence: Any, window: Window, px: Array) -> Array:
     """(p,) 0..1 from the network's confidence 1 … inf at working pixels: 1 - 1/c; 0 outside and where not finite."""
-    x, y = (np.round(px) - _corner(window)).astype(int).T
+    x, y = (np.round(px) - corner_of(window)).astype(int).T
     inside = (x >= 0) & (y >= 0) & (x < window.net_size[0]) & (y < window.net_size[1])
-    raw = _array(confidence)[np.where(inside, y, 0), np.where(inside, x, 0)].astype(float)
+    raw = as_array(confidence)[np.where(inside, y, 0), np.where(inside, x, 0)].astype(float)
     return np.where(inside & np.isfinite(raw) & (raw > 1), 1 - 1 / np.maximum(raw, 1), 0.0)
 
 

@@ -15,7 +15,6 @@ from .bonn import BonnSource
 from .image_folder import ImageFolderSource, image_files
 from .sequence import Sequenced, SequenceSource, Wants
 from .tum import TumSource
-from .video import VideoSource
 
 DEEP, LOOKED_AT = 4, 500  # levels and folders below the one that was named, in which sequences are looked for
 SHOWN = 6  # sequences that a message names
@@ -86,6 +85,8 @@ def open_source(
     if path.is_file():
         if config.kind not in ("auto", "video"):
             raise InputError(f"{path}: expected a folder, as --kind {config.kind} says, got a file")
+        from .video import VideoSource  # brings PyAV, which folders do not need
+
         return VideoSource(path, config, want_semantic=want_semantic, semantic_dir=semantic_dir)
     if not path.is_dir():
         raise InputError(f"{path}: expected a file or a folder, got something else")
