@@ -23,8 +23,8 @@ Array = NDArray[Any]
 class NetworkErrors:
     """1 sigma of each; ``bleed_px`` at working size."""
 
-    scale: float = 0.05  # of the log of a frame's scale
-    bend: float = 0.03  # of the log of depth at the nodes of a 4 x 3 grid, cubic between them
+    scale: float = 0.02  # of the log of a frame's scale
+    bend: float = 0.01  # of the log of depth at the nodes of a 4 x 3 grid, cubic between them
     bleed_px: float = 2.0  # blur of the inverse depth
 
 

@@ -75,21 +75,24 @@ def align_fine(
     chamfer_weight: float,
     kernel_px: float = 1.5,
     iterations: int = 20,
+    as_printed: bool = False,
 ) -> tuple[PoseReport, float]:
     """Minimise eq. (12), with the plus sign that print lost; returns the pose and new's scale.
 
-    Without own points the sum is the re-mapping term alone, on SE(3).
+    Without own points the sum is the re-mapping term alone, on SE(3). ``as_printed``: where there are own points,
+    the sum is theirs alone, and the scale stays as the stage before left it: T of eq. (11) is in SE(3).
     """
     pose, damping, converged, done = new_from_ref, 1e-4, False, 0
     log_scale = float(np.log(scale))
     near = _Neighbours()
-    state = _system(matches, own, pose, log_scale, chamfer_weight, kernel_px, near)
+    fixed = (kernel_px, near, as_printed)
+    state = _system(matches, own, pose, log_scale, chamfer_weight, *fixed)
     for done in range(1, iterations + 1):
         step = damped_solve(state[0], state[1], damping)
         if step is None or damping > 1e4:
             break
         trial_pose, trial_log = se3_exp(step[:6]) @ pose, log_scale + float(step[6])
-        trial = _system(matches, own, trial_pose, trial_log, chamfer_weight, kernel_px, near)
+        trial = _system(matches, own, trial_pose, trial_log, chamfer_weight, *fixed)
         if trial[2] > state[2] * (1 + 1e-9):
             damping *= 10
             continue
@@ -109,18 +112,20 @@ def _system(
     chamfer_weight: float,
     kernel_px: float,
     near: _Neighbours,
+    as_printed: bool,
 ) -> tuple[Array, Array, float]:
-    hess, rhs = np.zeros((7, 7)), np.zeros(7)
-    hess[:6, :6], rhs[:6], cost = pose_system(
-        matches.px,
-        matches.inv_depth,
-        matches.depth_info,
-        matches.target,
-        matches.weight,
-        pose,
-        matches.lens,
-        kernel_px,
-    )
+    hess, rhs, cost = np.zeros((7, 7)), np.zeros(7), 0.0
+    if own is None or not as_printed:
+        hess[:6, :6], rhs[:6], cost = pose_system(
+            matches.px,
+            matches.inv_depth,
+            matches.depth_info,
+            matches.target,
+            matches.weight,
+            pose,
+            matches.lens,
+            kernel_px,
+        )
     if own is None:
         return hess, rhs, cost
     used = own.weight > 0.05
@@ -132,4 +137,7 @@ def _system(
         parts.append(point_terms(moved[i], scaled[j], chamfer_weight * np.minimum(w[i], w[j]), sigma[j]))
     for h, b, c in parts:
         hess, rhs, cost = hess + h, rhs + b, cost + c
+    if as_printed:
+        hess[6], hess[:, 6], rhs[6] = 0.0, 0.0, 0.0
+        hess[6, 6] = 1.0
     return hess, rhs, cost
