@@ -73,6 +73,7 @@ HEAVY = {  # package: who may import it
 NAMES_A_DEVICE = {"mapping.rasterise"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
+TRUTH_GOES_TO = {"evaluate", "evaluate_trajectory"}
 EXITS = {"cli", "__main__"}
 
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -229,10 +230,10 @@ def test_truth_is_read_by_the_evaluation_only() -> None:
 
 
 def _truth_calls_passed_on(path: Path) -> set[ast.AST]:
-    """The ``x.truth`` of every ``evaluate(..., x.truth(), ...)``."""
+    """The ``x.truth`` of every ``evaluate(..., x.truth(), ...)`` or ``evaluate_trajectory(…)``."""
     found: set[ast.AST] = set()
     for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "evaluate":
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in TRUTH_GOES_TO:
             found |= {a.func for a in node.args if isinstance(a, ast.Call) and isinstance(a.func, ast.Attribute)}
     return found
 
