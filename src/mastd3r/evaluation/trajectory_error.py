@@ -200,14 +200,14 @@ def rpe_over_distance(
 def drift_distance(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> float:
     """The distance to measure drift over, in the truth's unit: 1, 10 or 100.
 
-    The smallest that is at least ten median steps of the true path, so that a pair of poses that far apart exists
-    (a car makes a metre a frame) and the steps' own noise does not count; 1 where nothing is known.
+    The smallest that is at least five median steps of the true path, so that pairs within a tenth of it exist
+    (a car makes a metre a frame); 1 where nothing is known.
     """
     _, true_poses, reason = _associated(estimate, truth, tolerance_s)
     if reason:
         return 1.0
     step = float(np.median(np.diff(_path_length(true_poses))))
-    return next((d for d in (1.0, 10.0) if d >= 10 * step), 100.0)
+    return next((d for d in (1.0, 10.0) if d >= 5 * step), 100.0)
 
 
 def _associated(estimate: Trajectory, truth: Truth, tolerance_s: float) -> tuple[Array, Array, str | None]:
