@@ -48,8 +48,10 @@ LAYERS: dict[str, set[str]] = {
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
     },
+    "experiments": {"config", "errors", "evaluation", "export"},
     "cli_weights": {"errors", "networks", "progress"},
-    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights"},
+    "cli_bench": {"errors", "experiments", "export"},
+    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "cli_bench"},
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
     "": set(),
@@ -68,7 +70,7 @@ HEAVY = {  # package: who may import it
     "gsplat": {"mapping"},
     "av": {"sources"},
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
-    "rich": {"progress", "cli_commands", "cli_weights"},
+    "rich": {"progress", "cli_commands", "cli_weights", "cli_bench"},
 }
 NAMES_A_DEVICE = {"mapping.rasterise"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import logging
+import os
 import shutil
 import tempfile
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,6 +20,7 @@ from rich.logging import RichHandler
 from rich.table import Table
 
 from . import __version__
+from .cli_bench import bench_parser
 from .cli_weights import weights_parser
 from .config import Config, config_from_dict, config_from_yaml, config_to_yaml, with_override
 from .errors import ConfigError
@@ -75,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     view = commands.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path)
     view.set_defaults(act=_view)
+    bench_parser(commands.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(commands.add_parser("weights", help="list, download and check the weights of the networks"))
     doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=_doctor)
@@ -106,6 +111,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--stride", type=int, help="every n-th frame")
     p.add_argument("--seed", type=int)
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
+    p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs of a bench
     p.set_defaults(act=_run)
 
 
@@ -141,8 +147,17 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _run(args: argparse.Namespace, console: Console) -> int:
+    if args.end_with_stdin:
+        threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
     return _run_and_show(args.source, args.out, config, args.words, console, quiet=args.quiet, maps=args.maps)
+
+
+def _interrupt_when_stdin_closes() -> None:
+    """Whoever started this run holds the other end: when that process is gone, this one ends as on Ctrl-C."""
+    while os.read(0, 1024):
+        pass
+    _thread.interrupt_main()
 
 
 def _run_and_show(

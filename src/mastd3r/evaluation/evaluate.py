@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..types import Frame, Trajectory, Truth
+from ..types import Frame, State, Trajectory, Truth
 from .image_error import psnr, ssim
 from .mask_error import MaskError, mask_error, read_mask
 from .trajectory_error import (
@@ -132,7 +132,8 @@ def read_poses(path: Path) -> Trajectory:
     known = np.isfinite(data[:, 4:]).all(1)
     poses[known, :3, :3] = Rotation.from_quat(data[known, 4:]).as_matrix()
     poses[~known, :3, :3] = np.nan
-    return Trajectory(data[:, 0], poses, ("tracked",) * len(data), np.zeros(len(data), bool))
+    tracked: State = "tracked"
+    return Trajectory(data[:, 0], poses, (tracked,) * len(data), np.zeros(len(data), bool))
 
 
 def _stamp(timestamp_s: float) -> str:

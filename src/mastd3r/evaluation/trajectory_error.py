@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..types import Trajectory, Truth
 
 Array = NDArray[Any]
+ASSOCIATION_S = 0.02  # a pose and a true pose that are further apart in time are no pair
 MIN_POSES = 4  # a Sim(3) has seven degrees of freedom: three points fit far too well to be an error
 
 
@@ -118,7 +119,7 @@ def associate(times_s: Array, truth_s: Array, tolerance_s: float) -> tuple[Array
 
 
 def ate_of_positions(
-    times_s: Array, positions: Array, truth_s: Array, truth_positions: Array, tolerance_s: float = 0.02
+    times_s: Array, positions: Array, truth_s: Array, truth_positions: Array, tolerance_s: float = ASSOCIATION_S
 ) -> AteResult:
     """ATE of (n, 3) positions against (m, 3) true positions after Sim(3) alignment; see ``ate_rmse``."""
     rows, truth_rows = associate(times_s, truth_s, tolerance_s)
@@ -145,7 +146,7 @@ def ate_of_positions(
     )
 
 
-def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> AteResult:
+def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = ASSOCIATION_S) -> AteResult:
     """Absolute trajectory error after Sim(3) alignment, in the truth's unit.
 
     Each pose is paired with the nearest true pose within ``tolerance_s``. Fewer than four pairs, a camera
@@ -160,7 +161,7 @@ def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> A
     )
 
 
-def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float = 0.02) -> RpeResult:
+def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float = ASSOCIATION_S) -> RpeResult:
     """Relative pose error over all pairs of associated poses ``delta`` rows apart.
 
     The estimate takes the scale of the Sim(3) alignment first. With true motion Q and estimated motion P
@@ -178,7 +179,7 @@ def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float =
 
 
 def rpe_over_distance(
-    estimate: Trajectory, truth: Truth, distance: float, tolerance_s: float = 0.02, slack_ratio: float = 0.1
+    estimate: Trajectory, truth: Truth, distance: float, tolerance_s: float = ASSOCIATION_S, slack_ratio: float = 0.1
 ) -> RpeResult:
     """Relative pose error over pairs that lie ``distance`` (truth's unit) apart along the TRUE path.
 
@@ -197,7 +198,7 @@ def rpe_over_distance(
     return _rpe_of_pairs(poses, true_poses, first, second)
 
 
-def drift_distance(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> float:
+def drift_distance(estimate: Trajectory, truth: Truth, tolerance_s: float = ASSOCIATION_S) -> float:
     """The distance to measure drift over, in the truth's unit: 1, 10 or 100.
 
     The smallest that is at least five median steps of the true path, so that pairs within a tenth of it exist

@@ -1,0 +1,102 @@
+"""What has to be said beside every table: how its figures were measured. Read from the code and the results."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..config import HOLDOUT_EVERY, Config, config_from_dict
+from ..evaluation.trajectory_error import ASSOCIATION_S
+from .suite import Suite, suite_from_dict
+
+NO_LPIPS = (
+    "LPIPS is not offered: every package that computes it needs torchvision and downloads the weights of a network "
+    "trained for classification, which this package does without."
+)
+
+
+def protocol(results: dict[str, Any]) -> list[str]:
+    """One line a topic, in plain words."""
+    suite = suite_from_dict(results["definition"], results["suite"])
+    complete = [r for r in results["entries"] if r["status"] == "complete"]
+    configs = [config_from_dict(r["config"]) for r in complete]
+    return [
+        _frames(complete, configs),
+        "ATE: RMSE over positions after Sim(3) alignment (Umeyama), poses paired with the nearest true pose within "
+        f"{ASSOCIATION_S * 1000:g} ms. All frames: every frame has a pose and counts; keyframes: those alone.",
+        "RPE: RMSE of relative poses after the same scale, from each frame to the next (a frame), and between poses a "
+        "fixed distance apart along the true path, divided by it (a metre).",
+        _images(configs),
+        "Speed: whole run = frames read by the seconds of everything from the first frame to the last file; tracking = "
+        "the first pass alone. Memory: the most that the process held; the accelerator's as torch counts it.",
+        *_seeds(results),
+        *_options(suite),
+        *_machines(complete),
+        NO_LPIPS,
+    ]
+
+
+def _frames(complete: list[dict[str, Any]], configs: list[Config]) -> str:
+    if not complete:
+        return "Frames: nothing has run yet."
+    counts: dict[str, set[str]] = {}
+    for r in complete:
+        size = (r.get("source") or {}).get("size") or ("?", "?")
+        said = f"{r['metrics'].get('frames_posed')} of {r['metrics'].get('frames')} posed at {size[0]}x{size[1]}"
+        counts.setdefault(r["sequence"], set()).add(said)
+    each = "; ".join(f"{name}: {' or '.join(sorted(said))}" for name, said in counts.items())
+    strides = sorted({c.source.stride for c in configs})
+    areas = sorted({c.tracking.area_px for c in configs})
+    stride, area = " or ".join(map(str, strides)), " or ".join(map(str, areas))
+    return f"Frames: {each}. Stride {stride}. Tracking sees them at {area} px or less."
+
+
+def _images(configs: list[Config]) -> str:
+    mapped = [c for c in configs if c.mapping.enabled]
+    if not mapped:
+        return "PSNR and SSIM: no map was made."
+    widths = " or ".join(str(w) for w in sorted({c.mapping.width_px for c in mapped}))
+    return (
+        f"PSNR and SSIM: the holdout, every {HOLDOUT_EVERY}th frame, is never shown to the map; rendered from the pose "
+        f"that tracking found, at {widths} px width, against the photograph at that size. Whole image unless the head "
+        "says static pixels, which are those that the true mask leaves."
+    )
+
+
+def _seeds(results: dict[str, Any]) -> list[str]:
+    seeds = sorted({r["seed"] for r in results["entries"]})
+    if not seeds:
+        return []
+    return [
+        f"Seeds: {', '.join(map(str, seeds))}. One seed gives one trajectory on one machine, so seed n also starts n "
+        "frames later; figures are the mean over seeds with least and most in brackets."
+    ]
+
+
+def _options(suite: Suite) -> list[str]:
+    """What differs from the defaults."""
+    lines = [f"Options of every run: {_joined(suite.settings)}."] if suite.settings else ["Options: the defaults."]
+    own = [f"{s.name}: {_joined(s.overrides)}" for s in suite.sequences or () if s.overrides]
+    lines += [f"Options of a sequence: {'; '.join(own)}."] if own else []
+    variants = [f"{v.title}: {_joined(v.overrides)}" for v in suite.variants]
+    return [*lines, f"Options of the variants: {'; '.join(variants)}."]
+
+
+def _joined(overrides: tuple[str, ...]) -> str:
+    return ", ".join(f"`{o}`" for o in overrides) or "none"
+
+
+def _machines(complete: list[dict[str, Any]]) -> list[str]:
+    if not complete:
+        return []
+    machines = sorted({_machine(r["machine"]) for r in complete})
+    commits = sorted({str(r["machine"].get("git_commit")) for r in complete})
+    dates = sorted({r["date"] for r in complete})
+    jobs = max(r["jobs"] for r in complete)
+    beside = f", up to {jobs} runs at once on cores of their own" if jobs > 1 else ", one run at a time"
+    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    return [f"Machine: {' and '.join(machines)}{beside}. Commit {' and '.join(commits)}. {when}."]
+
+
+def _machine(machine: dict[str, Any]) -> str:
+    card = machine.get("accelerator") or "no accelerator"
+    return f"{machine.get('processor')}, {machine.get('cores')} cores a run, {card}"
