@@ -96,7 +96,7 @@ def _write(
     """results.json, tables and plots of everything that has run, whatever --only chose."""
     from .experiments.plots import plots_of
     from .experiments.render import as_html, as_markdown
-    from .experiments.store import results_of
+    from .experiments.store import read_results, results_of
     from .experiments.suite import entries_of
     from .export.files import write_json, write_text
 
@@ -104,6 +104,7 @@ def _write(
     absent = tuple(s.name for s in sequences if s.name not in folders)
     results = results_of(suite, sequences, absent, _command(args), records)
     write_json(store.out / "results.json", results)
+    results = read_results(store.out / "results.json")  # what is drawn is what is kept
     plots = plots_of(results)
     for name, svg in plots.items():
         write_text(store.out / name, svg)

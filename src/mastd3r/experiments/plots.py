@@ -131,9 +131,10 @@ def _rows(results: dict[str, Any]) -> list[tuple[str, str, list[float]]]:
 
 
 def _paths(results: dict[str, Any], sequence: str) -> dict[str, Array]:
-    records = [r for r in results["entries"] if r["sequence"] == sequence and r.get("path")]
     order = list(_titles(results))
-    found = {r["variant"]: np.array(r["path"], float) for r in sorted(records, key=lambda r: order.index(r["variant"]))}
+    records = [r for r in results["entries"] if r["sequence"] == sequence and r.get("path")]
+    records.sort(key=lambda r: order.index(r["variant"]))
+    found = {r["variant"]: np.array([row.split() for row in r["path"]], float) for r in records}
     return {name: rows for name, rows in found.items() if np.isfinite(rows).all()}
 
 
@@ -146,9 +147,14 @@ def _colours(results: dict[str, Any]) -> dict[str, str]:
 
 
 def _log_ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten between two exponents."""
+    """Powers of ten between two exponents; 1, 2 and 5 times these, or all nine, where they are few."""
     powers = range(math.floor(low), math.ceil(high) + 1)
-    return [m * 10.0**p for p in powers for m in (1, 2, 5) if low <= math.log10(m * 10.0**p) <= high]
+    ticks: list[float] = []
+    for steps in ((1,), (1, 2, 5), range(1, 10)):
+        ticks = [float(f"{m}e{p}") for p in powers for m in steps if low <= math.log10(m * 10.0**p) <= high]
+        if len(ticks) > 2:
+            break
+    return ticks
 
 
 def _round(length: float) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..config import HOLDOUT_EVERY, Config, config_from_dict
+from ..config import HOLDOUT_EVERY
 from ..evaluation.trajectory_error import ASSOCIATION_S
 from .suite import Suite, suite_from_dict
 
@@ -18,7 +18,7 @@ def protocol(results: dict[str, Any]) -> list[str]:
     """One line a topic, in plain words."""
     suite = suite_from_dict(results["definition"], results["suite"])
     complete = [r for r in results["entries"] if r["status"] == "complete"]
-    configs = [config_from_dict(r["config"]) for r in complete]
+    configs = [r["config"] for r in complete]  # as they were: an old result may have options that are gone
     return [
         _frames(complete, configs),
         "ATE: RMSE over positions after Sim(3) alignment (Umeyama), poses paired with the nearest true pose within "
@@ -35,30 +35,34 @@ def protocol(results: dict[str, Any]) -> list[str]:
     ]
 
 
-def _frames(complete: list[dict[str, Any]], configs: list[Config]) -> str:
+def _frames(complete: list[dict[str, Any]], configs: list[dict[str, Any]]) -> str:
     if not complete:
         return "Frames: nothing has run yet."
-    counts: dict[str, set[str]] = {}
-    for r in complete:
-        size = (r.get("source") or {}).get("size") or ("?", "?")
-        said = f"{r['metrics'].get('frames_posed')} of {r['metrics'].get('frames')} posed at {size[0]}x{size[1]}"
-        counts.setdefault(r["sequence"], set()).add(said)
-    each = "; ".join(f"{name}: {' or '.join(sorted(said))}" for name, said in counts.items())
-    strides = sorted({c.source.stride for c in configs})
-    areas = sorted({c.tracking.area_px for c in configs})
-    stride, area = " or ".join(map(str, strides)), " or ".join(map(str, areas))
-    return f"Frames: {each}. Stride {stride}. Tracking sees them at {area} px or less."
+    each = []
+    for name in dict.fromkeys(r["sequence"] for r in complete):
+        mine = [r for r in complete if r["sequence"] == name]
+        width, height = (mine[0].get("source") or {}).get("size") or ("?", "?")
+        read = _range([r["metrics"]["frames"] for r in mine])
+        without = _range([r["metrics"]["frames"] - r["metrics"]["frames_posed"] for r in mine])
+        each.append(f"{name}: {read} of {width}x{height} px read, {without} without a pose")
+    stride = _range([c["source"]["stride"] for c in configs])
+    area = _range([c["tracking"]["area_px"] for c in configs])
+    return f"Frames: {'; '.join(each)}. Stride {stride}. Tracking sees images of {area} px or less."
 
 
-def _images(configs: list[Config]) -> str:
-    mapped = [c for c in configs if c.mapping.enabled]
+def _range(values: list[int]) -> str:
+    return str(min(values)) if min(values) == max(values) else f"{min(values)} to {max(values)}"
+
+
+def _images(configs: list[dict[str, Any]]) -> str:
+    mapped = [c["mapping"] for c in configs if c["mapping"]["enabled"]]
     if not mapped:
         return "PSNR and SSIM: no map was made."
-    widths = " or ".join(str(w) for w in sorted({c.mapping.width_px for c in mapped}))
+    steps, width = _range([m["iterations"] for m in mapped]), _range([m["width_px"] for m in mapped])
     return (
         f"PSNR and SSIM: the holdout, every {HOLDOUT_EVERY}th frame, is never shown to the map; rendered from the pose "
-        f"that tracking found, at {widths} px width, against the photograph at that size. Whole image unless the head "
-        "says static pixels, which are those that the true mask leaves."
+        f"that tracking found, at {width} px width, against the photograph at that size. Whole image unless the head "
+        f"says static pixels, which are those that the true mask leaves. Maps are trained for {steps} steps."
     )
 
 

@@ -50,8 +50,8 @@ class Store:
             yield None
             return
         with writing(self.out):
-            file = open(self.out / ".lock", "w")
-        with file:
+            (self.out / ".lock").touch()
+        with open(self.out / ".lock") as file:
             end = time.monotonic() + LOCK_WAIT_S
             while True:
                 try:
@@ -141,27 +141,76 @@ def record_of(entry: Entry, run: Path, *, exit_code: int, said: str, wall_s: flo
     return record
 
 
-def thinned(path: Path) -> list[list[float]]:
-    """Rows of aligned.txt, without times, at most so many, in four decimals: x y z and the true x y z."""
+def thinned(path: Path) -> list[str]:
+    """Rows of aligned.txt, without times, at most so many, in four decimals: "x y z true_x true_y true_z"."""
     rows = [line.split()[1:] for line in path.read_text().splitlines() if not line.startswith("#")]
     step = max(1, -(-len(rows) // PATH_POINTS))
-    return [[round(float(v), 4) for v in row] for row in rows[::step]]
+    return [" ".join(f"{float(v):.4f}" for v in row) for row in rows[::step]]
 
 
 def results_of(
     suite: Suite, sequences: tuple[SequenceSpec, ...], missing: tuple[str, ...], command: str, records: list[Any]
 ) -> dict[str, Any]:
-    """results.json: everything that tables and plots are made of. A path is kept for the first seed only."""
+    """results.json: everything that tables and plots are made of, and nothing twice.
+
+    A path is kept for the first seed only, and of a configuration what is not the same in all; ``config`` holds that.
+    """
     first = min((r["seed"] for r in records), default=0)
-    kept = [{k: v for k, v in r.items() if k != "path" or r["seed"] == first} for r in records]
+    common = _common([r["config"] for r in records]) if records else {}
+    kept = [
+        {k: v for k, v in r.items() if k != "choices" and (k != "path" or r["seed"] == first)}
+        | {"config": _without(r["config"], common)}
+        for r in records
+    ]
     return {
         "suite": suite.name,
         "definition": suite.raw,
         "sequences": [s.name for s in sequences],
         "missing": list(missing),
         "command": command,
+        "config": common,
         "entries": kept,
     }
+
+
+def read_results(path: Path) -> dict[str, Any]:
+    """results.json with the whole configuration in every entry again. Raises InputError."""
+    results = read_json(path)
+    if not {"suite", "definition", "sequences", "missing", "command", "config", "entries"} <= set(results):
+        raise InputError(f"{path}: expected the results.json of a bench, got {', '.join(results) or 'nothing'}")
+    whole = [{**e, "config": _joined(results["config"], e["config"])} for e in results["entries"]]
+    return {**results, "entries": whole}
+
+
+def _common(configs: list[dict[str, Any]]) -> dict[str, Any]:
+    """What all of them have."""
+    found: dict[str, Any] = {}
+    for key, value in configs[0].items():
+        values = [c.get(key) for c in configs]
+        if isinstance(value, dict):
+            found[key] = _common([v for v in values if isinstance(v, dict)])
+        elif all(v == value for v in values):
+            found[key] = value
+    return found
+
+
+def _without(config: dict[str, Any], common: dict[str, Any]) -> dict[str, Any]:
+    left: dict[str, Any] = {}
+    for key, value in config.items():
+        if isinstance(value, dict):
+            if own := _without(value, common.get(key, {})):
+                left[key] = own
+        elif key not in common:
+            left[key] = value
+    return left
+
+
+def _joined(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    joined = {**common, **own}
+    for key in set(common) & set(own):
+        if isinstance(common[key], dict):
+            joined[key] = _joined(common[key], own[key])
+    return joined
 
 
 def _read(path: Path) -> dict[str, Any]:

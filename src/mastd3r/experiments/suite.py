@@ -267,9 +267,9 @@ def _sequences(data: Any, where: str) -> tuple[SequenceSpec, ...] | None:
     if data == "any":
         return None
     found = []
-    for name, value in _mapping(data, where).items():
+    for name, given in _mapping(data, where).items():
         at = f"{where}.{name}"
-        value = _mapping(value if value is not None else {}, at, {"dataset", "folder", "set"})
+        value = _mapping(given if given is not None else {}, at, {"dataset", "folder", "set"})
         overrides = _overrides(value.get("set", {}), f"{at}.set")
         found.append(SequenceSpec(name, str(value.get("dataset", "")), str(value.get("folder", "")), overrides))
     if not found:
@@ -281,9 +281,9 @@ def _tables(data: Any, variants: list[str], where: str) -> tuple[TableSpec, ...]
     if not isinstance(data, list) or not data:
         raise ConfigError(f"{where}: expected a list of tables, got {data!r}")
     found = []
-    for number, value in enumerate(data):
+    for number, given in enumerate(data):
         at = f"{where}[{number}]"
-        value = _mapping(value, at, {"title", "form", "variants", "metrics", "published"}, {"title", "form", "metrics"})
+        value = _mapping(given, at, {"title", "form", "variants", "metrics", "published"}, {"title", "form", "metrics"})
         form = FORMS.get(value["form"]) if isinstance(value["form"], str) else None
         if form is None:
             raise ConfigError(f"{at}.form: expected one of {', '.join(FORMS)}, got {value['form']!r}")

@@ -120,7 +120,7 @@ def _over_sequences(spec: TableSpec, figures: Figures) -> Table:
             for column in columns:
                 mean = _mean(figures, variant, column, metric)
                 text = figures.text(variant, column, metric) if column else _shown(metric, mean)
-                cells.append(Cell(text, mean is not None and mean == best[column]))
+                cells.append(Cell(text, mean is not None and number(metric, mean) == best[column]))
             table.rows.append([*cells, Cell("this run")])
         for row in published_table(spec.published).rows:
             if row.metric == metric:
@@ -147,7 +147,7 @@ def _of_variants(spec: TableSpec, figures: Figures) -> Table:
             for metric in spec.metrics:
                 mean = figures.mean(variant, sequence, metric)
                 text = figures.text(variant, sequence, metric)
-                cells.append(Cell(text, mean is not None and mean == best[metric]))
+                cells.append(Cell(text, mean is not None and number(metric, mean) == best[metric]))
             table.rows.append(cells)
     if len(figures.sequences) > 1:
         table.rows += _mean_rows(spec, figures)
@@ -169,7 +169,8 @@ def _mean_rows(spec: TableSpec, figures: Figures) -> list[list[Cell]]:
         cells = [Cell(f"mean of {len(figures.sequences)}"), Cell(_title(figures.suite, variant))]
         for metric in spec.metrics:
             mean = figures.mean_of_all(variant, metric)
-            cells.append(Cell(_shown(metric, mean), mean is not None and mean == best[metric]))
+            text = _shown(metric, mean)
+            cells.append(Cell(text, mean is not None and text == best[metric]))
         rows.append(cells)
     return rows
 
@@ -178,12 +179,12 @@ def _mean(figures: Figures, variant: str, column: str, metric: str) -> float | N
     return figures.mean(variant, column, metric) if column else figures.mean_of_all(variant, metric)
 
 
-def _best(metric: str, values: list[float | None]) -> float | None:
-    """The best of our own, where there is more than one to choose from."""
+def _best(metric: str, values: list[float | None]) -> str | None:
+    """The best of our own as it is shown, where what is shown differs: a tie is bold in every row."""
     known, higher = [v for v in values if v is not None], higher_is_better(metric)
-    if len(set(known)) < 2 or higher is None:
+    if len({number(metric, v) for v in known}) < 2 or higher is None:
         return None
-    return max(known) if higher else min(known)
+    return number(metric, max(known) if higher else min(known))
 
 
 def _shown(metric: str, value: float | None) -> str:
