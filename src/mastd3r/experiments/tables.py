@@ -125,6 +125,7 @@ def _over_sequences(spec: TableSpec, figures: Figures) -> Table:
         for row in published_table(spec.published).rows:
             if row.metric == metric:
                 table.rows.append(_printed_over_sequences(row, figures.sequences))
+                table.notes += _odd_mean(row)
     _add_sources(table, published_table(spec.published).rows)
     return table
 
@@ -135,6 +136,19 @@ def _printed_over_sequences(row: PublishedRow, sequences: list[str]) -> list[Cel
     mean = float(np.mean(known)) if known and len(known) == len(values) else None
     texts = [_shown(row.metric, v) for v in [*values, mean]]
     return [Cell(row.name), Cell(head_of(row.metric)), *map(Cell, texts), Cell(f"[{_mark(row.source)}]")]
+
+
+def _odd_mean(row: PublishedRow) -> list[str]:
+    """Where the mean that was printed is not that of the columns that were printed."""
+    mean = float(np.mean(list(row.values.values())))
+    if row.average is None or abs(mean - row.average) < 1.01 * 10.0 ** -_digits(row.average):
+        return []
+    text = f"{number(row.metric, row.average)} for {row.name}, of columns whose mean is {number(row.metric, mean)}"
+    return [f"[{_mark(row.source)}] prints a mean {NAMES[row.metric][0]} of {text}."]
+
+
+def _digits(value: float) -> int:
+    return len(str(value).partition(".")[2])
 
 
 def _of_variants(spec: TableSpec, figures: Figures) -> Table:
