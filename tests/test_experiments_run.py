@@ -136,10 +136,10 @@ def _most_at_once(spans: list[tuple[float, float]]) -> int:
 def test_memory_is_what_the_like_of_an_entry_took(tmp_path: Path) -> None:
     store, chosen = Store(tmp_path / "out"), entries()
     store.prepare()
-    assert [store.memory_mib(e) for e in chosen[:4]] == [200, 200, 300, 300]
+    assert list(store.needs(chosen[:4]).values()) == [200, 200, 300, 300]
     go(store, chosen[:1], Fake())
     other_seed = next(e for e in chosen if e.label == "a/one/1")
-    assert [store.memory_mib(e) for e in (other_seed, chosen[1])] == [50, 200]
+    assert list(store.needs([other_seed, chosen[1]]).values()) == [50, 200]
 
 
 def test_a_budget_that_one_entry_exceeds_is_refused_before_anything_runs(tmp_path: Path) -> None:

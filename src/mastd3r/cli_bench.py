@@ -62,11 +62,12 @@ def _is_missing(record: dict[str, Any] | None, retry: bool) -> bool:
 
 def _show_list(chosen: list[Entry], folders: dict[str, Path], store: Store) -> int:
     table = Table("", "sequence/variant/seed", "state", "needs [MiB]", "took [s]")
+    needs = store.needs(chosen)
     for number, entry in enumerate(chosen, 1):
         record = store.get(entry)
         state = record["status"] if record else "to run" if entry.sequence.name in folders else "sequence missing"
         took = f"{record['wall_s']:.0f}" if record else ""
-        table.add_row(str(number), entry.label, state, f"{store.memory_mib(entry):.0f}", took)
+        table.add_row(str(number), entry.label, state, f"{needs[entry.id]:.0f}", took)
     Console().print(table)
     return 0
 

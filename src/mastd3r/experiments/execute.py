@@ -78,30 +78,33 @@ def run_entries(
     their memory and its own, measured on its like or declared, keep within the budget. Ctrl-C stops what runs
     and records nothing of it. Raises ConfigError before anything starts where one entry alone is over the budget.
     """
+    needs = store.needs(entries)
     for entry in entries:
-        if (need := store.memory_mib(entry)) > allowed.memory_mib:
+        if (need := needs[entry.id]) > allowed.memory_mib:
             got = f"{allowed.memory_mib:.0f}"
             raise ConfigError(f"--memory-mib: expected {need:.0f} or more, which {entry.label} needs, got {got}")
     with store.locked() as lock:
         waiting, running = deque(entries), list[Running]()
         with _stopped_at_the_end(running):
             while waiting or running:
-                while waiting and _fits(waiting[0], running, store, allowed):
+                while waiting and _fits(needs[waiting[0].id], running, allowed):
                     entry = waiting.popleft()
                     argv = launch(entry, folders[entry.sequence.name], _fresh(store.run_folder(entry)))
-                    running.append(_start(entry, argv, store, running, allowed.jobs, lock))
+                    running.append(_start(entry, argv, needs[entry.id], store, running, allowed.jobs, lock))
                     for other in running:
                         other.jobs = max(other.jobs, len(running))
                 time.sleep(POLL_S)
                 for finished in [r for r in running if r.process.poll() is not None]:
                     running.remove(finished)
                     done(finished.entry, _recorded(finished, store))
+                    needs = store.needs(waiting)
 
 
-def _fits(entry: Entry, running: list[Running], store: Store, allowed: Limits) -> bool:
+def _fits(need_mib: float, running: list[Running], allowed: Limits) -> bool:
+    """An entry whose like has just shown that it needs more than the budget still runs, alone."""
     if len(running) >= allowed.jobs:
         return False
-    return sum(r.memory_mib for r in running) + store.memory_mib(entry) <= allowed.memory_mib or not running
+    return not running or sum(r.memory_mib for r in running) + need_mib <= allowed.memory_mib
 
 
 def _fresh(folder: Path) -> Path:
@@ -112,7 +115,15 @@ def _fresh(folder: Path) -> Path:
     return folder
 
 
-def _start(entry: Entry, argv: list[str], store: Store, running: list[Running], jobs: int, lock: int | None) -> Running:
+def _start(
+    entry: Entry,
+    argv: list[str],
+    need_mib: float,
+    store: Store,
+    running: list[Running],
+    jobs: int,
+    lock: int | None,
+) -> Running:
     """The entry's process on cores of its own, so that jobs side by side do not fight for them."""
     with writing(store.runs), open(store.runs / f"{entry.id}.log", "wb") as log:
         process = subprocess.Popen(
@@ -126,7 +137,7 @@ def _start(entry: Entry, argv: list[str], store: Store, running: list[Running], 
     if cores:
         with suppress(ProcessLookupError):  # it has ended already: its exit code will tell
             os.sched_setaffinity(process.pid, cores)
-    return Running(entry, process, store.memory_mib(entry), cores, time.monotonic(), len(running) + 1)
+    return Running(entry, process, need_mib, cores, time.monotonic(), len(running) + 1)
 
 
 def _cores(jobs: int, taken: list[tuple[int, ...]]) -> tuple[int, ...]:

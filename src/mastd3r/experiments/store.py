@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -83,21 +83,18 @@ class Store:
         """Where the run itself writes."""
         return self.runs / entry.id
 
-    def memory_mib(self, entry: Entry) -> float:
-        """What an entry needs: the most that its like has been seen to take, or what the suite declares."""
-        seen = [r for r in self._all() if r["sequence"] == entry.sequence.name and r["variant"] == entry.variant.name]
-        peaks = [r["metrics"].get("peak_rss_mib") for r in seen if r["status"] == "complete"]
-        known = [float(p) for p in peaks if p]
-        return max(known) if known else entry.variant.memory_mib
-
-    def _all(self) -> list[dict[str, Any]]:
-        found = []
-        for path in sorted(self.entries.glob("*.json")):
+    def needs(self, entries: Sequence[Entry]) -> dict[str, float]:
+        """MiB that entries need, by id: the most that their like has been seen to take, or what the suite declares."""
+        seen: dict[tuple[Any, Any], float] = {}
+        for path in self.entries.glob("*.json"):
             try:
-                found.append(read_json(path))
+                record = read_json(path)
             except InputError:  # half a file from outside: as if it were not there
                 continue
-        return [r for r in found if {"sequence", "variant", "status", "metrics"} <= set(r)]
+            key, peak = (record.get("sequence"), record.get("variant")), record.get("metrics", {}).get("peak_rss_mib")
+            if peak and record.get("status") == "complete":
+                seen[key] = max(peak, seen.get(key, 0.0))
+        return {e.id: seen.get((e.sequence.name, e.variant.name), e.variant.memory_mib) for e in entries}
 
 
 def described(entry: Entry) -> dict[str, Any]:
