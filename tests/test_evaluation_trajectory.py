@@ -209,18 +209,23 @@ def test_rpe_refuses_deltas_that_do_not_fit() -> None:
     assert rpe(*arguments, delta=9).n_pairs == 1
 
 
-def test_drift_is_measured_where_the_camera_rests_too() -> None:
-    """A path of whole metres with rests: pairs are those of evo, and a scale error of a tenth is a tenth a metre."""
-    x = np.array([0, 0, 0, 1, 2, 2, 3, 4, 4, 4, 5, 6, 7, 7.0])
-    truth = np.tile(np.eye(4), (len(x), 1, 1))
-    truth[:, 0, 3] = x
-    truth[:, 1, 3] = np.where(x == 7, 1, 0)
-    times = np.arange(len(x), dtype=float)
+@pytest.mark.parametrize(
+    ("way", "corner", "distance"),
+    [
+        ([0, 0, 0, 1, 2, 2, 3, 4, 4, 4, 5, 6, 7, 7], 3.0, 2.0),
+        ([0, 0.95, 0.95, 0.95, 2.1, 2.1, 3.05, 3.05, 4.1, 4.1, 5.05, 5.05], 3.05, 1.0),  # rests just short of it
+    ],
+)
+def test_drift_is_measured_where_the_camera_rests_too(way: list[float], corner: float, distance: float) -> None:
+    """Where several poses are equally far, the first of them is meant, as in evo."""
+    truth = np.tile(np.eye(4), (len(way), 1, 1))
+    truth[:, 0, 3], truth[:, 1, 3] = np.minimum(way, corner), np.maximum(np.array(way) - corner, 0)
+    times = np.arange(len(way), dtype=float)
     estimate = disturbed(np.random.default_rng(3), truth, 0.02)
-    drift = rpe_over_distance(trajectory(times, estimate), Truth(times, truth), 2.0)
-    expected = evo_drift(estimate, truth, times, 2.0)
+    drift = rpe_over_distance(trajectory(times, estimate), Truth(times, truth), distance)
+    expected = evo_drift(estimate, truth, times, distance)
     assert [drift.translation_rmse, drift.rotation_rmse_rad] == pytest.approx(expected, rel=1e-9)
-    assert drift.n_pairs < len(x) - 1  # no pair beyond the end
+    assert drift.n_pairs < len(way) - 1  # no pair beyond the end
 
 
 @pytest.mark.parametrize(("step_m", "distance"), [(0.01, 1), (0.19, 1), (0.21, 10), (1.9, 10), (3, 100), (30, 100)])

@@ -98,6 +98,9 @@ def test_half_a_record_and_a_half_written_run_are_redone(tmp_path: Path) -> None
     store, entry = Store(tmp_path / "out"), entries()[0]
     store.prepare()
     (store.entries / f"{entry.id}.json").write_text('{"id": "')
+    assert store.get(entry) is None
+    (store.entries / f"{entry.id}.json").write_text('{"id": "another", "status": "complete"}')
+    assert store.get(entry) is None
     store.run_folder(entry).mkdir()
     (store.run_folder(entry) / "trajectory.txt").write_text("half")
     fake = Fake()

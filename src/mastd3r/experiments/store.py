@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -61,7 +60,6 @@ class Store:
                     if time.monotonic() > end:
                         raise OutputError(f"{self.out}: expected no other bench at work in it, got one") from e
                     time.sleep(0.2)
-            os.set_inheritable(file.fileno(), True)
             yield file.fileno()
 
     def get(self, entry: Entry) -> dict[str, Any] | None:
