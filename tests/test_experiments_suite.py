@@ -157,7 +157,7 @@ def test_a_file_that_does_not_fit_is_named(data: Any, says: str) -> None:
 def test_where_sequences_are_looked_for(tmp_path: Path) -> None:
     suite = suite_from_dict(TINY, "tiny")
     a, b = suite.sequences or ()
-    assert a.find(tmp_path) is None and b.how_to_get() == "mastd3r download bonn b" and a.how_to_get() == ""
+    assert a.find(tmp_path) is None and b.how_to_get() == "mastd3r download bonn b --to DATA" and a.how_to_get() == ""
     (tmp_path / "a").mkdir()
     (tmp_path / "bonn" / "rgbd_b").mkdir(parents=True)
     assert a.find(tmp_path) == tmp_path / "a" and b.find(tmp_path) == tmp_path / "bonn" / "rgbd_b"

@@ -115,7 +115,7 @@ def test_the_page_says_how_everything_was_measured() -> None:
         assert said in text, said
         assert said.replace("`", "") in page, said
     lost = as_markdown(results("bonn", BONN, [], tuple(BONN)))
-    assert "balloon: not in the data folder; `mastd3r download bonn balloon` brings it" in lost
+    assert "balloon: not in the data folder; `mastd3r download bonn balloon --to DATA` brings it" in lost
     assert "nothing has run yet" in lost and "0.0284" in lost  # what others printed is there all the same
 
 

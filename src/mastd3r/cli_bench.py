@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 def bench_parser(p: argparse.ArgumentParser) -> None:
     """Fill in the parser of ``bench``."""
     p.add_argument("suite", help="tum-dynamic, bonn, kitti, correction, loss, local, or a YAML file of your own")
-    p.add_argument("--data", type=Path, default=Path("data"), help="folder that holds the sequences (default data)")
+    p.add_argument(
+        "--data", type=Path, default=Path("datasets"), help="folder that holds the sequences (default datasets)"
+    )
     p.add_argument("--out", type=Path, help="where results go and stay (default runs/bench-SUITE)")
     p.add_argument("--jobs", type=int, metavar="N", help="runs at once, each on its share of the cores (default 1)")
     p.add_argument("--memory-mib", type=float, metavar="M", help="for all of them (default: 80 %% of the machine's)")

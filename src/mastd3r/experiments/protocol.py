@@ -9,8 +9,8 @@ from ..evaluation.trajectory_error import ASSOCIATION_S
 from .suite import Suite, suite_from_dict
 
 NO_LPIPS = (
-    "LPIPS is not offered: the packages that compute it (lpips, piq, torchmetrics) need torchvision and the weights of a "
-    "network trained for classification, which this package does without."
+    "LPIPS is not offered: the packages that compute it (lpips, piq, torchmetrics) need torchvision and the weights of "
+    "a network trained for classification, which this package does without."
 )
 
 

@@ -38,6 +38,7 @@ class SequenceSpec:
     name: str
     dataset: str = ""  # as ``mastd3r download`` names it; empty: nothing to download
     folder: str = ""  # under the data folder, or under the dataset's folder there; empty: the name
+    download: str = ""  # its name for ``mastd3r download``; empty: the name
     overrides: tuple[str, ...] = ()
 
     def find(self, data: Path) -> Path | None:
@@ -48,7 +49,7 @@ class SequenceSpec:
 
     def how_to_get(self) -> str:
         """The command that brings it; nothing where none does."""
-        return f"mastd3r download {self.dataset} {self.name}" if self.dataset else ""
+        return f"mastd3r download {self.dataset} {self.download or self.name} --to DATA" if self.dataset else ""
 
 
 @dataclass(frozen=True)
@@ -269,9 +270,10 @@ def _sequences(data: Any, where: str) -> tuple[SequenceSpec, ...] | None:
     found = []
     for name, given in _mapping(data, where).items():
         at = f"{where}.{name}"
-        value = _mapping(given if given is not None else {}, at, {"dataset", "folder", "set"})
+        value = _mapping(given if given is not None else {}, at, {"dataset", "folder", "download", "set"})
         overrides = _overrides(value.get("set", {}), f"{at}.set")
-        found.append(SequenceSpec(name, str(value.get("dataset", "")), str(value.get("folder", "")), overrides))
+        words = [str(value.get(key, "")) for key in ("dataset", "folder", "download")]
+        found.append(SequenceSpec(name, *words, overrides))
     if not found:
         raise ConfigError(f"{where}: expected 'any', or at least one sequence, got none")
     return tuple(found)
