@@ -239,7 +239,9 @@ def test_results_come_back_with_every_configuration_whole(tmp_path: Path) -> Non
     store, chosen = Store(tmp_path / "out"), entries()
     go(store, [chosen[0], chosen[2], chosen[4]], Fake())
     records = [r for e in chosen if (r := store.get(e)) is not None]
-    results = results_of(SUITE, SUITE.sequences or (), ("b",), "mastd3r bench tiny", records)
+    (tmp_path / "info.json").write_text('{"composed": true}')
+    results = results_of(SUITE, SUITE.sequences or (), {"a": tmp_path}, "mastd3r bench tiny", records)
+    assert (results["missing"], results["composed"]) == (["b"], ["a"])
     assert results["config"]["tracking"] == records[0]["config"]["tracking"]
     own = {"correction": "none", "seed": 0, "source": {"start": 0}}  # what is not the same in all, and no more
     assert results["entries"][1]["config"] == own

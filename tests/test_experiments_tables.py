@@ -5,6 +5,9 @@ from __future__ import annotations
 import html
 import json
 import re
+import runpy
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
@@ -22,6 +25,7 @@ from mastd3r.experiments.store import read_results
 from mastd3r.experiments.suite import SHIPPED
 from mastd3r.experiments.tables import Table, head_of, number, tables_of
 
+ROOT = Path(__file__).resolve().parents[1]
 CONFIG = yaml.safe_load(config_to_yaml(Config()))
 MACHINE = {"processor": "a processor", "cores": 2, "git_commit": "abc"}
 
@@ -40,7 +44,8 @@ def record(sequence: str, variant: str, seed: int, status: str = "complete", **m
 def results(suite: str, sequences: list[str], records: list[dict[str, Any]], missing: tuple[str, ...] = ()) -> Any:
     definition = yaml.safe_load((SHIPPED / f"{suite}.yaml").read_text())
     head = {"suite": suite, "definition": definition, "sequences": sequences, "missing": list(missing)}
-    return {**head, "command": f"mastd3r bench {suite} --data DATA", "config": {}, "entries": records}
+    command = f"mastd3r bench {suite} --data DATA"
+    return {**head, "composed": sequences[:1], "command": command, "config": {}, "entries": records}
 
 
 def rows_of(table: Table) -> list[list[str]]:
@@ -107,6 +112,7 @@ def test_the_page_says_how_everything_was_measured() -> None:
     text, page = as_markdown(made), html.unescape(re.sub("<[^>]+>", "", as_html(made)))
     for said in (
         "By `mastd3r bench local --data DATA`", "jam: 9 of 640x480 px read, 1 without a pose", "Stride 1",
+        "Semi-synthetic", "composited in: jam.",
         "Sim(3)", "within 20 ms", "every 8th frame", "Whole image unless", "Seeds: 0, 2.", "starts n frames later",
         "coarse: `correction=coarse`, `mapping.enabled=false`", "one run at a time", "Commit abc",
         "LPIPS is not offered",
@@ -138,6 +144,29 @@ def test_results_of_something_else_are_refused(tmp_path: Path) -> None:
     (tmp_path / "r.json").write_text(json.dumps({"kitchen": {}}))
     with pytest.raises(InputError, match=r"expected the results\.json of a bench, got kitchen"):
         read_results(tmp_path / "r.json")
+
+
+def test_the_results_page_is_what_its_command_writes(tmp_path: Path) -> None:
+    """Nothing in docs/results.md is typed by hand, and nothing in it is older than the JSON."""
+    page = tmp_path / "results.md"
+    words = [sys.executable, "benchmarks/tables.py", "benchmarks/results/sequences.json", str(page)]
+    subprocess.run(words, cwd=ROOT, check=True, timeout=120)
+    assert page.read_text() == (ROOT / "docs" / "results.md").read_text()
+    for plot in (tmp_path / "plots").glob("*.svg"):
+        assert plot.read_text() == (ROOT / "docs" / "plots" / plot.name).read_text()
+
+
+def test_a_bench_becomes_a_section_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "bench").mkdir()
+    made = results("local", ["jam"], [record("jam", "none", 0, ate_rmse_all=0.0321)])
+    (tmp_path / "bench" / "local.json").write_text(json.dumps(made))
+    (tmp_path / "sequences.json").write_text("{}")
+    tables = runpy.run_path(str(ROOT / "benchmarks" / "tables.py"))
+    monkeypatch.setattr(sys, "argv", ["tables.py", str(tmp_path / "sequences.json"), str(tmp_path / "page.md")])
+    assert tables["main"]() == 0
+    text = (tmp_path / "page.md").read_text()
+    assert "## Pose correction and rendering loss" in text and "0.0321" in text and "(plots/local_paths.svg)" in text
+    assert (tmp_path / "plots" / "local_paths.svg").read_text().startswith("<svg")
 
 
 # -- the command -----------------------------------------------------------------------------------------------------

@@ -104,8 +104,7 @@ def _write(
     from .export.files import write_json, write_text
 
     records = [r for e in entries_of(suite, sequences, args.seeds) if (r := store.get(e)) is not None]
-    absent = tuple(s.name for s in sequences if s.name not in folders)
-    results = results_of(suite, sequences, absent, _command(args), records)
+    results = results_of(suite, sequences, folders, _command(args), records)
     write_json(store.out / "results.json", results)
     results = read_results(store.out / "results.json")  # what is drawn is what is kept
     plots = plots_of(results)

@@ -70,7 +70,7 @@ def paths(results: dict[str, Any]) -> str:
         return ""
     columns = min(3, len(panels))
     size = (WIDTH - 20 * (columns + 1)) / columns
-    tall = size * 0.8
+    tall = min(size * 0.8, 300.0)
     drawn = list(dict.fromkeys(v for _, found in panels for v in found))
     colours, titles = _colours(results), _titles(results)
     out: list[str] = []

@@ -21,6 +21,7 @@ def protocol(results: dict[str, Any]) -> list[str]:
     configs = [r["config"] for r in complete]  # as they were: an old result may have options that are gone
     return [
         _frames(complete, configs),
+        *_composed(results),
         "ATE: RMSE over positions after Sim(3) alignment (Umeyama), poses paired with the nearest true pose within "
         f"{ASSOCIATION_S * 1000:g} ms. All frames: every frame has a pose and counts; keyframes: those alone.",
         "RPE: RMSE of relative poses after the same scale, from each frame to the next (a frame), and between poses a "
@@ -48,6 +49,11 @@ def _frames(complete: list[dict[str, Any]], configs: list[dict[str, Any]]) -> st
     stride = _range([c["source"]["stride"] for c in configs])
     area = _range([c["tracking"]["area_px"] for c in configs])
     return f"Frames: {'; '.join(each)}. Stride {stride}. Tracking sees images of {area} px or less."
+
+
+def _composed(results: dict[str, Any]) -> list[str]:
+    names = ", ".join(results.get("composed", []))
+    return [f"Semi-synthetic, real images with a real person composited in: {names}."] if names else []
 
 
 def _range(values: list[int]) -> str:
@@ -78,7 +84,7 @@ def _seeds(results: dict[str, Any]) -> list[str]:
 
 def _options(suite: Suite) -> list[str]:
     """What differs from the defaults."""
-    lines = [f"Options of every run: {_joined(suite.settings)}."] if suite.settings else ["Options: the defaults."]
+    lines = [f"Options of every run: {_joined(suite.settings) if suite.settings else 'the defaults'}."]
     own = [f"{s.name}: {_joined(s.overrides)}" for s in suite.sequences or () if s.overrides]
     lines += [f"Options of a sequence: {'; '.join(own)}."] if own else []
     variants = [f"{v.title}: {_joined(v.overrides)}" for v in suite.variants]

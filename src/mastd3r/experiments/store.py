@@ -144,11 +144,12 @@ def thinned(path: Path) -> list[str]:
 
 
 def results_of(
-    suite: Suite, sequences: tuple[SequenceSpec, ...], missing: tuple[str, ...], command: str, records: list[Any]
+    suite: Suite, sequences: tuple[SequenceSpec, ...], folders: dict[str, Path], command: str, records: list[Any]
 ) -> dict[str, Any]:
     """results.json: everything that tables and plots are made of, and nothing twice.
 
-    A path is kept for the first seed only, and of a configuration what is not the same in all; ``config`` holds that.
+    ``folders`` has those of the sequences that are there. A path is kept for the first seed only, and of a
+    configuration what is not the same in all; ``config`` holds the rest.
     """
     first = min((r["seed"] for r in records), default=0)
     common = _common([r["config"] for r in records]) if records else {}
@@ -161,7 +162,8 @@ def results_of(
         "suite": suite.name,
         "definition": suite.raw,
         "sequences": [s.name for s in sequences],
-        "missing": list(missing),
+        "missing": [s.name for s in sequences if s.name not in folders],
+        "composed": [s.name for s in sequences if s.name in folders and _is_composed(folders[s.name])],
         "command": command,
         "config": common,
         "entries": kept,
@@ -175,6 +177,11 @@ def read_results(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: expected the results.json of a bench, got {', '.join(results) or 'nothing'}")
     whole = [{**e, "config": _joined(results["config"], e["config"])} for e in results["entries"]]
     return {**results, "entries": whole}
+
+
+def _is_composed(folder: Path) -> bool:
+    """True where a folder's info.json says that people were put into its pictures."""
+    return _read(folder / "info.json").get("composed") is True
 
 
 def _common(configs: list[dict[str, Any]]) -> dict[str, Any]:

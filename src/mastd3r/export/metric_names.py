@@ -32,7 +32,7 @@ NAMES: dict[str, tuple[str, str, str]] = {
     "peak_gpu_mib": ("Peak memory of the accelerator", ".0f", "MiB"),
     "focal_px": ("Focal length at full width", ".1f", "px"),
     "gaussians": ("Gaussians", ",d", ""),
-    "cloud_mib": ("Size of cloud.ply", ".1f", "MiB"),
+    "cloud_mib": ("Size of cloud.ply", ".2f", "MiB"),
 }
 
 
