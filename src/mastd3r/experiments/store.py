@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -123,7 +124,7 @@ def record_of(entry: Entry, run: Path, *, exit_code: int, said: str, wall_s: flo
         "status": "complete" if complete else "failed",
         "error": None if complete else _why(exit_code, said, told),
         "exit_code": exit_code,
-        "command": " ".join(command_of(entry, entry.sequence.folder or entry.sequence.name, "RUN")),
+        "command": shlex.join(command_of(entry, entry.sequence.folder or entry.sequence.name, "RUN")),
         "metrics": found if complete else {},
         "wall_s": round(wall_s, 1),
         "jobs": jobs,
