@@ -141,6 +141,10 @@ BAD: list[tuple[Any, str]] = [
     ),
     (changed(tables=[{"title": "t", "form": "variants", "metrics": ["ate"]}]), "metrics: unknown ate"),
     (
+        changed(tables=[{"title": "t", "form": "variants", "metrics": ["frames"], "published": "ours"}]),
+        "published: expected one of tum-dynamic",
+    ),
+    (
         changed(tables=[{"title": "t", "form": "variants", "metrics": ["frames"], "variants": ["tow"]}]),
         "variants: unknown tow; perhaps you meant two",
     ),

@@ -24,6 +24,7 @@ import yaml
 from ..config import Config, config_to_yaml, with_override
 from ..errors import ConfigError, InputError
 from ..export.metric_names import NAMES
+from .published import published_table
 
 SHIPPED = Path(__file__).parents[1] / "suites"
 MEMORY_MIB = 1500.0  # of an entry where neither a finished one nor the suite tells
@@ -291,7 +292,12 @@ def _tables(data: Any, variants: list[str], where: str) -> tuple[TableSpec, ...]
             raise ConfigError(f"{at}.form: expected one of {', '.join(FORMS)}, got {value['form']!r}")
         chosen = _names(value.get("variants", variants), variants, f"{at}.variants")
         metrics = _names(value["metrics"], list(NAMES), f"{at}.metrics")
-        found.append(TableSpec(str(value["title"]), form, chosen, metrics, str(value.get("published", ""))))
+        published = str(value.get("published", ""))
+        try:
+            published_table(published)
+        except ConfigError as e:
+            raise ConfigError(f"{at}: {e}") from e
+        found.append(TableSpec(str(value["title"]), form, chosen, metrics, published))
     return tuple(found)
 
 
