@@ -273,8 +273,8 @@ def _sequences(data: Any, where: str) -> tuple[SequenceSpec, ...] | None:
         at = f"{where}.{name}"
         value = _mapping(given if given is not None else {}, at, {"dataset", "folder", "download", "set"})
         overrides = _overrides(value.get("set", {}), f"{at}.set")
-        words = [str(value.get(key, "")) for key in ("dataset", "folder", "download")]
-        found.append(SequenceSpec(name, *words, overrides))
+        dataset, folder, download = (str(value.get(key, "")) for key in ("dataset", "folder", "download"))
+        found.append(SequenceSpec(name, dataset, folder, download, overrides))
     if not found:
         raise ConfigError(f"{where}: expected 'any', or at least one sequence, got none")
     return tuple(found)
