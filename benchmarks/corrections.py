@@ -100,7 +100,11 @@ def main() -> None:
                 entries[key] |= tracked(source, config, errors, seed)
                 print(key, entries[key], flush=True)
                 info = machine_info()
-                made = {"date": time.strftime("%Y-%m-%d"), "git_commit": info["git_commit"], "processor": info["processor"]}
+                made = {
+                    "date": time.strftime("%Y-%m-%d"),
+                    "git_commit": info["git_commit"],
+                    "processor": info["processor"],
+                }
                 args.out.write_text(json.dumps({"about": about, "made": made, "entries": entries}, indent=1) + "\n")
 
 

@@ -1,6 +1,9 @@
-"""Turn the JSON of benchmarks/sequences.py into docs/results.md. No number there is typed by hand.
+"""Turn the JSON of benchmarks/sequences.py and of ``mastd3r bench`` into docs/results.md. No number is typed by hand.
 
 usage: python benchmarks/tables.py results.json docs/results.md
+
+Beside results.json: endurance.json, reference.json, and in bench/ the results.json of each bench under its suite's
+name. Plots go into a folder plots beside the page.
 """
 
 from __future__ import annotations
@@ -10,6 +13,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mastd3r.experiments.plots import plots_of
+from mastd3r.experiments.render import as_markdown
+from mastd3r.experiments.store import read_results
 from networks_table import networks
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -65,10 +71,25 @@ def main() -> int:
         lines.append(f"| {name} | `{entry['command']}` | {when} | {machine} |")
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
+    lines += experiments(source.parent / "bench", target.parent / "plots")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += networks(source.parent / "networks.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
+
+
+def experiments(folder: Path, plots_folder: Path) -> list[str]:
+    """A section for each bench, with its plots; nothing where none has run."""
+    out: list[str] = []
+    for path in sorted(folder.glob("*.json")):
+        results = read_results(path)
+        plots = plots_of(results)
+        plots_folder.mkdir(exist_ok=True)
+        for name, svg in plots.items():
+            (plots_folder / name).write_text(svg)
+        names = tuple(f"{plots_folder.name}/{name}" for name in plots)
+        out += ["", *as_markdown(results, names, level=2).rstrip().splitlines()]
+    return out
 
 
 def endurance(path: Path) -> list[str]:

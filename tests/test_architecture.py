@@ -54,9 +54,13 @@ LAYERS: dict[str, set[str]] = {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
         "view_depth",
     },
+    "experiments": {"config", "errors", "evaluation", "export"},
     "cli_weights": {"errors", "fetch", "networks", "progress"},
     "cli_download": {"errors", "fetch", "datasets", "progress"},
-    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "cli_download"},
+    "cli_bench": {"errors", "experiments", "export"},
+    "cli_commands": {
+        "", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "cli_bench", "cli_download",
+    },
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
     "": set(),
@@ -75,11 +79,12 @@ HEAVY = {  # package: who may import it
     "gsplat": {"mapping"},
     "av": {"sources"},
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
-    "rich": {"progress", "cli_commands", "cli_weights", "cli_download"},
+    "rich": {"progress", "cli_commands", "cli_weights", "cli_bench", "cli_download"},
 }
 NAMES_A_DEVICE = {"mapping.rasterise", "networks.record"}  # the latter: recordings are CUDA's
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
+TRUTH_GOES_TO = {"evaluate", "evaluate_trajectory"}
 EXITS = {"cli", "__main__"}
 
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
@@ -236,10 +241,10 @@ def test_truth_is_read_by_the_evaluation_only() -> None:
 
 
 def _truth_calls_passed_on(path: Path) -> set[ast.AST]:
-    """The ``x.truth`` of every ``evaluate(..., x.truth(), ...)``."""
+    """The ``x.truth`` of every ``evaluate(..., x.truth(), ...)`` or ``evaluate_trajectory(…)``."""
     found: set[ast.AST] = set()
     for node in ast.walk(tree(path)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func) == "evaluate":
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in TRUTH_GOES_TO:
             found |= {a.func for a in node.args if isinstance(a, ast.Call) and isinstance(a.func, ast.Attribute)}
     return found
 

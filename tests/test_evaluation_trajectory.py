@@ -11,7 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mastd3r.evaluation.trajectory_error import associate, ate_rmse, rotation_angle_rad, rpe, umeyama
+from mastd3r.evaluation.trajectory_error import (
+    associate,
+    ate_rmse,
+    drift_distance,
+    rotation_angle_rad,
+    rpe,
+    rpe_over_distance,
+    umeyama,
+)
 from mastd3r.types import Trajectory, Truth
 
 DATA = Path(os.environ.get("MASTD3R_DATA", Path(__file__).parents[1] / "../shared/data"))
@@ -63,6 +71,24 @@ def evo_figures(estimate: np.ndarray, truth: np.ndarray, times_s: np.ndarray) ->
     return out
 
 
+def evo_drift(estimate: np.ndarray, truth: np.ndarray, times_s: np.ndarray, distance: float) -> tuple[float, float]:
+    """RPE over a distance along the true path: translation, rotation in radians, RMSE over all pairs."""
+    from evo.core import metrics
+    from evo.core.trajectory import PoseTrajectory3D
+
+    ref = PoseTrajectory3D(poses_se3=list(truth), timestamps=times_s)
+    est = PoseTrajectory3D(poses_se3=list(estimate), timestamps=times_s)
+    est.align(ref, correct_scale=True)
+    found = []
+    for kind in (metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_rad):
+        error = metrics.RPE(
+            kind, delta=distance, delta_unit=metrics.Unit.meters, all_pairs=True, pairs_from_reference=True
+        )
+        error.process_data((ref, est))
+        found.append(float(error.get_statistic(metrics.StatisticsType.rmse)))
+    return found[0], found[1]
+
+
 def assert_equals_evo(estimate: np.ndarray, truth: np.ndarray, times_s: np.ndarray) -> None:
     ours = ate_rmse(trajectory(times_s, estimate), Truth(times_s, truth))
     evo = evo_figures(estimate, truth, times_s)
@@ -75,6 +101,11 @@ def assert_equals_evo(estimate: np.ndarray, truth: np.ndarray, times_s: np.ndarr
         assert error.n_pairs == len(times_s) - delta
         assert error.translation_rmse == pytest.approx(evo[f"translation{delta}"], rel=1e-9)
         assert error.rotation_rmse_rad == pytest.approx(evo[f"rotation{delta}"], rel=1e-9)
+    made, true = trajectory(times_s, estimate), Truth(times_s, truth)
+    distance = min(drift_distance(made, true), 0.3 * np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum())
+    drift = rpe_over_distance(made, true, distance)
+    expected = evo_drift(estimate, truth, times_s, distance)
+    assert [drift.translation_rmse, drift.rotation_rmse_rad] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -176,6 +207,44 @@ def test_rpe_refuses_deltas_that_do_not_fit() -> None:
     assert "more than 10 associated poses, got 10" in (rpe(*arguments, delta=10).reason or "")
     assert "got 0" in (rpe(*arguments, delta=0).reason or "")
     assert rpe(*arguments, delta=9).n_pairs == 1
+
+
+@pytest.mark.parametrize(
+    ("way", "corner", "distance"),
+    [
+        ([0, 0, 0, 1, 2, 2, 3, 4, 4, 4, 5, 6, 7, 7], 3.0, 2.0),
+        ([0, 0.95, 0.95, 0.95, 2.1, 2.1, 3.05, 3.05, 4.1, 4.1, 5.05, 5.05], 3.05, 1.0),  # rests just short of it
+    ],
+)
+def test_drift_is_measured_where_the_camera_rests_too(way: list[float], corner: float, distance: float) -> None:
+    """Where several poses are equally far, the first of them is meant, as in evo."""
+    truth = np.tile(np.eye(4), (len(way), 1, 1))
+    truth[:, 0, 3], truth[:, 1, 3] = np.minimum(way, corner), np.maximum(np.array(way) - corner, 0)
+    times = np.arange(len(way), dtype=float)
+    estimate = disturbed(np.random.default_rng(3), truth, 0.02)
+    drift = rpe_over_distance(trajectory(times, estimate), Truth(times, truth), distance)
+    expected = evo_drift(estimate, truth, times, distance)
+    assert [drift.translation_rmse, drift.rotation_rmse_rad] == pytest.approx(expected, rel=1e-9)
+    assert drift.n_pairs < len(way) - 1  # no pair beyond the end
+
+
+@pytest.mark.parametrize(("step_m", "distance"), [(0.01, 1), (0.19, 1), (0.21, 10), (1.9, 10), (3, 100), (30, 100)])
+def test_drift_distance_has_five_steps(step_m: float, distance: float) -> None:
+    truth = np.tile(np.eye(4), (50, 1, 1))
+    truth[:, 0, 3] = step_m * np.arange(50)
+    truth[:, 2, 3] = np.sin(np.arange(50)) * 1e-6
+    times = np.arange(50.0)
+    assert drift_distance(trajectory(times, truth), Truth(times, truth)) == distance
+
+
+def test_drift_that_cannot_be_measured_says_why() -> None:
+    poses = random_poses(np.random.default_rng(0), 10)
+    arguments = trajectory(np.arange(10.0), poses), Truth(np.arange(10.0), poses)
+    assert "apart along a true path" in (rpe_over_distance(*arguments, distance=1000).reason or "")
+    assert "above 0" in (rpe_over_distance(*arguments, distance=0).reason or "")
+    still = trajectory(np.arange(10.0), np.tile(np.eye(4), (10, 1, 1)))
+    assert "never moves" in (rpe_over_distance(still, arguments[1], 1).reason or "")
+    assert drift_distance(still, arguments[1]) == 1
 
 
 def test_truth_in_the_map_lies_on_an_exact_estimate() -> None:

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import logging
+import os
 import shutil
 import tempfile
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
+import numpy as np
 import yaml
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.table import Table
 
 from . import __version__
+from .cli_bench import bench_parser
 from .cli_download import download_parser
 from .cli_weights import weights_parser
 from .config import Config, SourceKind, config_from_dict, config_from_yaml, config_to_yaml, with_override
@@ -66,10 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
     demo.set_defaults(act=_demo)
-    ev = commands.add_parser("eval", help="score a run folder against a sequence with truth")
-    ev.add_argument("run", type=Path)
-    ev.add_argument("sequence", type=Path)
-    ev.set_defaults(act=_eval)
+    _eval_parser(commands.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     export = commands.add_parser("export", help="write a run's trajectory or splat in another format")
     export.add_argument("run", type=Path)
     export.add_argument("--to", choices=("tum", "kitti", "colmap"), required=True)
@@ -78,11 +80,20 @@ def _parser() -> argparse.ArgumentParser:
     view = commands.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path)
     view.set_defaults(act=_view)
+    bench_parser(commands.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(commands.add_parser("weights", help="list, download and check the weights of the networks"))
     download_parser(commands.add_parser("download", help="list and bring the public datasets"))
     doctor = commands.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=_doctor)
     return parser
+
+
+def _eval_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("paths", type=Path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
+    p.add_argument("--trajectory", type=Path, metavar="FILE", help="poses that another system has written")
+    p.add_argument("--format", choices=("tum", "kitti", "euroc"), help="of that file")
+    p.add_argument("--out", type=Path, metavar="FILE", help="with --trajectory: write the figures as JSON")
+    p.set_defaults(act=_eval)
 
 
 def _run_parser(p: argparse.ArgumentParser) -> None:
@@ -103,6 +114,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--stride", type=int, help="every n-th frame")
     p.add_argument("--seed", type=int)
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
+    p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs of a bench
     p.set_defaults(act=_run)
 
 
@@ -141,8 +153,17 @@ def _numbers(text: str) -> tuple[float, ...]:
 
 
 def _run(args: argparse.Namespace, console: Console) -> int:
+    if args.end_with_stdin:
+        threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
     return _run_and_show(args.source, args.out, config, args.words, console, quiet=args.quiet, maps=args.maps)
+
+
+def _interrupt_when_stdin_closes() -> None:
+    """Whoever started this run holds the other end: when that process is gone, this one ends as on Ctrl-C."""
+    while os.read(0, 1024):
+        pass
+    _thread.interrupt_main()
 
 
 def _run_and_show(
@@ -196,13 +217,38 @@ def _eval(args: argparse.Namespace, console: Console) -> int:
     from .export.read_run import read_run
     from .sources import open_source
 
-    recorded = read_run(args.run)
+    if args.trajectory is not None:
+        return _eval_trajectory(args)
+    if len(args.paths) != 2 or args.format or args.out:
+        got = "--format or --out without it" if args.format or args.out else f"{len(args.paths)} path(s)"
+        raise ConfigError(f"eval: expected RUN SEQUENCE, or --trajectory FILE --format KIND SEQUENCE, got {got}")
+    run, sequence = args.paths
+    recorded = read_run(run)
     config = config_from_dict(yaml.safe_load(recorded.config) or {}) if recorded.config else Config()
-    source = open_source(args.sequence, config.source)
-    found = evaluate(args.run, source.truth(), source.frames()).metrics
+    source = open_source(sequence, config.source)
+    found = evaluate(run, source.truth(), source.frames()).metrics
     metrics = {**recorded.metrics, **found}
-    write_json(args.run / "metrics.json", metrics)
+    write_json(run / "metrics.json", metrics)
     Console().print(_table(metrics))
+    return 0
+
+
+def _eval_trajectory(args: argparse.Namespace) -> int:
+    """Another system's poses, scored as our own are; rows that have no time are the frames' in order."""
+    from .evaluation.evaluate import evaluate_trajectory
+    from .export.files import write_json
+    from .export.trajectory_files import read_trajectory
+    from .sources import open_source
+
+    if len(args.paths) != 1 or args.format is None:
+        got = f"{len(args.paths)} paths and --format {args.format}"
+        raise ConfigError(f"eval --trajectory: expected --format tum, kitti or euroc and one SEQUENCE, got {got}")
+    source = open_source(args.paths[0], Config().source)
+    times_s = np.array([f.timestamp_s for f in source.frames()])
+    found = evaluate_trajectory(read_trajectory(args.trajectory, args.format, times_s), source.truth(), times_s)
+    Console().print(_table(found.metrics))
+    if args.out is not None:
+        write_json(args.out, found.metrics)
     return 0
 
 

@@ -65,7 +65,9 @@ class AlignmentConfig:
 
     chamfer_weight: float = 0.1  # lambda_cham of eq. (12)
     min_matches: int = 40  # weighted matches below which a pair cannot be aligned
-    as_printed: bool = False  # True: eq. (11)(12) with 3-D residuals alone, on SE(3), for views with points of their own
+    as_printed: bool = (
+        False  # True: eq. (11)(12) with 3-D residuals alone, on SE(3), for views with points of their own
+    )
 
 
 @dataclass(frozen=True)

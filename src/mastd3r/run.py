@@ -27,6 +27,7 @@ from .geometry.camera import Camera
 from .lens_view import LensView
 from .mapping.mapper import Mapper
 from .mapping.ply import write_gaussians_ply
+from .mapping.rasterise import accelerator
 from .parts import build_parts
 from .progress import Reporter, Silent
 from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
@@ -271,7 +272,12 @@ class _Job:
             "fps_total": frames / elapsed,
             "peak_rss_mib": peak_rss_mib(),
         }
+        if (card := accelerator()) is not None:
+            self.folder.update(accelerator=card[0])
+            self.metrics["peak_gpu_mib"] = card[1]
         self.folder.write_metrics(self.metrics)
+        if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
+            self.folder.write_aligned(aligned)
         self.folder.update(timings_s=self.timings)
         self.folder.finish()
         recorded = read_run(self.folder.path)

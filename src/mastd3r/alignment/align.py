@@ -48,9 +48,7 @@ def align(
     information = np.zeros((6, 6))
     if correction in ("fine", "coarse-to-fine"):
         printed = config.as_printed and own is not None
-        fine, scale = align_fine(
-            matches, own, pose, scale, chamfer_weight=config.chamfer_weight, as_printed=printed
-        )
+        fine, scale = align_fine(matches, own, pose, scale, chamfer_weight=config.chamfer_weight, as_printed=printed)
         pose, converged, information = fine.new_from_ref, fine.converged, fine.information
         iterations += fine.iterations
         stages.append("fine")

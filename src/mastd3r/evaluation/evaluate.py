@@ -1,4 +1,4 @@
-"""Figures of a run folder, from its files alone: trajectory.txt, keyframes.txt, masks/ and renders/."""
+"""Figures of a run folder, from its files alone: trajectory.txt, keyframes.txt, cloud.ply, masks/ and renders/."""
 
 from __future__ import annotations
 
@@ -10,15 +10,25 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..types import Frame, Truth
+from ..types import Frame, State, Trajectory, Truth
 from .image_error import psnr, ssim
 from .mask_error import MaskError, mask_error, read_mask
-from .trajectory_error import AteResult, ate_of_positions
+from .trajectory_error import (
+    AteResult,
+    associate,
+    ate_of_positions,
+    ate_rmse,
+    drift_distance,
+    rpe,
+    rpe_over_distance,
+)
 
 Array = NDArray[Any]
 PSNR_CEILING_DB = float(10 * np.log10(255**2 / 1e-9))  # stands for equal images, so that a mean exists
+SAME_TIME_S = 0.001  # other systems round timestamps in ways of their own
 MIN_STATIC_PX = 50  # fewer static pixels in a render say nothing
 
 
@@ -30,6 +40,7 @@ class HoldoutError:
     psnr_db: float
     ssim: float
     psnr_static_db: float | None  # over truly static pixels; None where truth has no masks
+    ssim_static: float | None = None  # likewise
 
 
 @dataclass(frozen=True)
@@ -58,7 +69,8 @@ def evaluate(
     truth are absent without it; a figure that truth cannot give is None and ``*_note`` says why.
     Raises InputError for a missing or malformed file and for renders of another sequence.
     """
-    times, positions = read_positions(run_dir / "trajectory.txt")
+    trajectory = read_poses(run_dir / "trajectory.txt")
+    times, positions = trajectory.timestamps_s, trajectory.world_from_cam[:, :3, 3]
     moving = {_stamp(t): path for t, path in truth.moving_files.items()} if truth else {}
     seen, holdout = _compare_renders(run_dir, frames, moving)
     stamps = seen if timestamps_s is None else [_stamp(float(t)) for t in timestamps_s]
@@ -66,14 +78,36 @@ def evaluate(
     metrics: dict[str, Any] = {"frames": len(stamps), "frames_posed": sum(s in posed for s in stamps)}
     ate = None
     if truth is not None and len(truth.timestamps_s):
-        ate = _add_trajectory_error(metrics, run_dir, truth, times, positions)
+        ate = _add_trajectory_error(metrics, trajectory, truth)
+        _add_keyframe_error(metrics, run_dir, truth)
     _add_holdout(metrics, holdout)
+    if (run_dir / "cloud.ply").is_file():
+        metrics["cloud_mib"] = (run_dir / "cloud.ply").stat().st_size / 2**20
     _add_masks(metrics, _masks(run_dir, stamps, moving), has_truth=bool(moving))
     return Evaluation(metrics, ate, tuple(holdout))
 
 
+def evaluate_trajectory(trajectory: Trajectory, truth: Truth | None, timestamps_s: Array) -> Evaluation:
+    """Score poses alone, such as another system's, against a sequence whose frames have the times (n,).
+
+    The same figures by the same code as those of ``evaluate``. Raises InputError where truth has no poses.
+    """
+    if truth is None or not len(truth.timestamps_s):
+        raise InputError("expected a sequence with true poses, got one without")
+    finite = np.isfinite(trajectory.world_from_cam).all((1, 2))
+    posed, _ = associate(timestamps_s, trajectory.timestamps_s[finite], SAME_TIME_S)
+    metrics: dict[str, Any] = {"frames": len(timestamps_s), "frames_posed": len(posed)}
+    return Evaluation(metrics, _add_trajectory_error(metrics, trajectory, truth), ())
+
+
 def read_positions(path: Path) -> tuple[Array, Array]:
     """Times (n,) and positions (n, 3) of a TUM trajectory file, in order of time. Raises InputError."""
+    trajectory = read_poses(path)
+    return trajectory.timestamps_s, trajectory.world_from_cam[:, :3, 3]
+
+
+def read_poses(path: Path) -> Trajectory:
+    """Every row of a TUM trajectory file, in order of time. Raises InputError."""
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as e:
@@ -84,14 +118,22 @@ def read_positions(path: Path) -> tuple[Array, Array]:
             continue
         words = line.split()
         try:
-            rows.append([float(w) for w in words[:4]])
+            rows.append([float(w) for w in words])
         except ValueError as e:
             raise InputError(f"{path} line {number}: expected numbers, got {line[:60]!r}") from e
         if len(words) != 8:
             raise InputError(f"{path} line {number}: expected 8 numbers, got {len(words)}")
-    data = np.array(rows, float).reshape(-1, 4)
+        if not any(rows[-1][4:]):
+            raise InputError(f"{path} line {number}: expected a quaternion, got one of length 0")
+    data = np.array(rows, float).reshape(-1, 8)
     data = data[np.argsort(data[:, 0], kind="stable")]
-    return data[:, 0], data[:, 1:]
+    poses = np.tile(np.eye(4), (len(data), 1, 1))
+    poses[:, :3, 3] = data[:, 1:4]
+    known = np.isfinite(data[:, 4:]).all(1)
+    poses[known, :3, :3] = Rotation.from_quat(data[known, 4:]).as_matrix()
+    poses[~known, :3, :3] = np.nan
+    tracked: State = "tracked"
+    return Trajectory(data[:, 0], poses, (tracked,) * len(data), np.zeros(len(data), bool))
 
 
 def _stamp(timestamp_s: float) -> str:
@@ -99,21 +141,39 @@ def _stamp(timestamp_s: float) -> str:
     return f"{timestamp_s:.6f}"
 
 
-def _add_trajectory_error(
-    metrics: dict[str, Any], run_dir: Path, truth: Truth, times: Array, positions: Array
-) -> AteResult:
-    true_positions = truth.world_from_cam[:, :3, 3]
-    ate = ate_of_positions(times, positions, truth.timestamps_s, true_positions)
+def _add_trajectory_error(metrics: dict[str, Any], trajectory: Trajectory, truth: Truth) -> AteResult:
+    """ATE over all poses; RPE from each pose to the next, and over a distance, as drift a metre."""
+    ate = ate_rmse(trajectory, truth)
     metrics["ate_rmse_all"] = ate.rmse
     if ate.reason:
         metrics["ate_rmse_all_note"] = ate.reason
-    if (run_dir / "keyframes.txt").exists():
-        kf_times, kf_positions = read_positions(run_dir / "keyframes.txt")
-        kf = ate_of_positions(kf_times, kf_positions, truth.timestamps_s, true_positions)
-        metrics["ate_rmse_keyframes"] = kf.rmse
-        if kf.reason:
-            metrics["ate_rmse_keyframes_note"] = kf.reason
+        return ate
+    step = rpe(trajectory, truth)
+    metrics["rpe_translation_frame"] = step.translation_rmse
+    metrics["rpe_rotation_frame_deg"] = _degrees(step.rotation_rmse_rad)
+    distance = drift_distance(trajectory, truth)
+    drift = rpe_over_distance(trajectory, truth, distance)
+    metrics["rpe_translation_metre"] = None if drift.translation_rmse is None else drift.translation_rmse / distance
+    metrics["rpe_rotation_metre_deg"] = _degrees(drift.rotation_rmse_rad, distance)
+    if drift.reason:
+        metrics["rpe_translation_metre_note"] = drift.reason
+    else:
+        metrics["rpe_distance"] = distance
     return ate
+
+
+def _degrees(angle_rad: float | None, over: float = 1.0) -> float | None:
+    return None if angle_rad is None else float(np.degrees(angle_rad)) / over
+
+
+def _add_keyframe_error(metrics: dict[str, Any], run_dir: Path, truth: Truth) -> None:
+    if not (run_dir / "keyframes.txt").exists():
+        return
+    times, positions = read_positions(run_dir / "keyframes.txt")
+    kf = ate_of_positions(times, positions, truth.timestamps_s, truth.world_from_cam[:, :3, 3])
+    metrics["ate_rmse_keyframes"] = kf.rmse
+    if kf.reason:
+        metrics["ate_rmse_keyframes_note"] = kf.reason
 
 
 def _compare_renders(
@@ -147,15 +207,15 @@ def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: b
     whole, similar = psnr(splat, photograph), ssim(splat, photograph)
     if whole is None or similar is None:
         raise InputError(f"{render_path}: expected an image of some size, got {size}")
-    static_db = None
+    static_db, static_similar = None, None
     if has_masks:
         static = np.ones(size[::-1], bool)
         if moving is not None:
             static = np.asarray(cv2.resize(moving, size, interpolation=cv2.INTER_NEAREST)) <= 127
         if static.sum() > MIN_STATIC_PX:
-            static_db = psnr(splat, photograph, static)
+            static_db, static_similar = psnr(splat, photograph, static), ssim(splat, photograph, static)
     capped = None if static_db is None else min(static_db, PSNR_CEILING_DB)
-    return HoldoutError(frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped)
+    return HoldoutError(frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped, static_similar)
 
 
 def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
@@ -167,6 +227,9 @@ def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
     static = [h.psnr_static_db for h in holdout if h.psnr_static_db is not None]
     if static:
         metrics["psnr_holdout_static"] = float(np.mean(static))
+    similar = [h.ssim_static for h in holdout if h.ssim_static is not None]
+    if similar:
+        metrics["ssim_holdout_static"] = float(np.mean(similar))
 
 
 def _masks(run_dir: Path, stamps: list[str], moving: dict[str, str]) -> MaskError:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..types import Trajectory, Truth
 
 Array = NDArray[Any]
+ASSOCIATION_S = 0.02  # a pose and a true pose that are further apart in time are no pair
 MIN_POSES = 4  # a Sim(3) has seven degrees of freedom: three points fit far too well to be an error
 
 
@@ -49,6 +50,7 @@ class AteResult:
     scale: float | None = None  # truth's unit per map unit
     truth_from_map: Similarity | None = None
     rows: Array | None = None  # (n_associated,) rows of the estimate
+    times_s: Array | None = None  # (n_associated,) their times
     aligned: Array | None = None  # (n_associated, 3) estimated positions in the truth's frame
     truth: Array | None = None  # (n_associated, 3) true positions
     reason: str | None = None  # why there is no figure
@@ -63,10 +65,16 @@ class AteResult:
         placed[self.rows] = self.truth_from_map.inverse().apply(self.truth)
         return placed
 
+    def table(self) -> Array | None:
+        """(n_associated, 7) rows of time [s], aligned estimate and truth in the truth's unit; None without figures."""
+        if self.times_s is None or self.aligned is None or self.truth is None:
+            return None
+        return np.concatenate([self.times_s[:, None], self.aligned, self.truth], 1)
+
 
 @dataclass(frozen=True)
 class RpeResult:
-    """Relative pose error over pairs ``delta`` frames apart. Where ``reason`` is set, figures are None."""
+    """Relative pose error over pairs of poses. Where ``reason`` is set, figures are None."""
 
     translation_rmse: float | None = None  # truth's unit
     translation_mean: float | None = None
@@ -111,7 +119,7 @@ def associate(times_s: Array, truth_s: Array, tolerance_s: float) -> tuple[Array
 
 
 def ate_of_positions(
-    times_s: Array, positions: Array, truth_s: Array, truth_positions: Array, tolerance_s: float = 0.02
+    times_s: Array, positions: Array, truth_s: Array, truth_positions: Array, tolerance_s: float = ASSOCIATION_S
 ) -> AteResult:
     """ATE of (n, 3) positions against (m, 3) true positions after Sim(3) alignment; see ``ate_rmse``."""
     rows, truth_rows = associate(times_s, truth_s, tolerance_s)
@@ -132,12 +140,13 @@ def ate_of_positions(
         scale=truth_from_map.scale,
         truth_from_map=truth_from_map,
         rows=rows,
+        times_s=np.asarray(times_s, float)[rows],
         aligned=aligned,
         truth=truth,
     )
 
 
-def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> AteResult:
+def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = ASSOCIATION_S) -> AteResult:
     """Absolute trajectory error after Sim(3) alignment, in the truth's unit.
 
     Each pose is paired with the nearest true pose within ``tolerance_s``. Fewer than four pairs, a camera
@@ -152,7 +161,7 @@ def ate_rmse(estimate: Trajectory, truth: Truth, tolerance_s: float = 0.02) -> A
     )
 
 
-def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float = 0.02) -> RpeResult:
+def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float = ASSOCIATION_S) -> RpeResult:
     """Relative pose error over all pairs of associated poses ``delta`` rows apart.
 
     The estimate takes the scale of the Sim(3) alignment first. With true motion Q and estimated motion P
@@ -160,18 +169,83 @@ def rpe(estimate: Trajectory, truth: Truth, delta: int = 1, tolerance_s: float =
     """
     if delta < 1:
         return RpeResult(reason=f"expected a delta of 1 frame or more, got {delta}")
+    poses, true_poses, reason = _associated(estimate, truth, tolerance_s)
+    if reason:
+        return RpeResult(reason=reason)
+    if len(poses) <= delta:
+        return RpeResult(reason=f"expected more than {delta} associated poses, got {len(poses)}")
+    first = np.arange(len(poses) - delta)
+    return _rpe_of_pairs(poses, true_poses, first, first + delta)
+
+
+def rpe_over_distance(
+    estimate: Trajectory, truth: Truth, distance: float, tolerance_s: float = ASSOCIATION_S, slack_ratio: float = 0.1
+) -> RpeResult:
+    """Relative pose error over pairs that lie ``distance`` (truth's unit) apart along the TRUE path.
+
+    Each pose is paired with the later one whose path length from it is nearest to ``distance``; pairs off by more
+    than ``slack_ratio`` of it are left out. Otherwise as ``rpe``; the error is that over the whole distance.
+    """
+    if not distance > 0:
+        return RpeResult(reason=f"expected a distance above 0, got {distance:g}")
+    poses, true_poses, reason = _associated(estimate, truth, tolerance_s)
+    if reason:
+        return RpeResult(reason=reason)
+    path = _path_length(true_poses)
+    first, second = _pairs_along(path, distance, slack_ratio)
+    if not len(first):
+        return RpeResult(reason=f"expected poses {distance:g} apart along a true path of {path[-1]:.3g}, got none")
+    return _rpe_of_pairs(poses, true_poses, first, second)
+
+
+def drift_distance(estimate: Trajectory, truth: Truth, tolerance_s: float = ASSOCIATION_S) -> float:
+    """The distance to measure drift over, in the truth's unit: 1, 10 or 100.
+
+    The smallest that is at least five median steps of the true path, so that pairs within a tenth of it exist
+    (a car makes a metre a frame); 1 where nothing is known.
+    """
+    _, true_poses, reason = _associated(estimate, truth, tolerance_s)
+    if reason:
+        return 1.0
+    step = float(np.median(np.diff(_path_length(true_poses))))
+    return next((d for d in (1.0, 10.0) if d >= 5 * step), 100.0)
+
+
+def _associated(estimate: Trajectory, truth: Truth, tolerance_s: float) -> tuple[Array, Array, str | None]:
+    """Paired poses (k, 4, 4), the estimated ones in the truth's unit; or the reason why there are none."""
+    nothing = np.zeros((0, 4, 4))
     ate = ate_rmse(estimate, truth, tolerance_s)
     if ate.reason or ate.scale is None:
-        return RpeResult(reason=ate.reason)
+        return nothing, nothing, ate.reason or "expected a scale, got none"
     rows, truth_rows = associate(estimate.timestamps_s, truth.timestamps_s, tolerance_s)
-    if len(rows) <= delta:
-        return RpeResult(reason=f"expected more than {delta} associated poses, got {len(rows)}")
     poses, true_poses = estimate.world_from_cam[rows].astype(float), truth.world_from_cam[truth_rows]
     if not (np.isfinite(poses).all() and np.isfinite(true_poses).all()):
-        return RpeResult(reason="expected finite poses, got a rotation that is not")
+        return nothing, nothing, "expected finite poses, got a rotation that is not"
     poses[:, :3, 3] *= ate.scale
-    moved = np.linalg.inv(poses[:-delta]) @ poses[delta:]
-    truly_moved = np.linalg.inv(true_poses[:-delta]) @ true_poses[delta:]
+    return poses, true_poses, None
+
+
+def _path_length(poses: Array) -> Array:
+    """(k,) length of the path from the first pose on."""
+    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
+def _pairs_along(path: Array, distance: float, slack_ratio: float) -> tuple[Array, Array]:
+    """Rows (i, j), j > i, of which j lies nearest to ``distance`` after i, within the slack."""
+    wanted, first = path[:-1] + distance, np.arange(len(path) - 1)
+    after = np.clip(np.searchsorted(path, wanted), 1, len(path) - 1)
+    ends = np.stack([after - 1, after])
+    ends = np.maximum(np.searchsorted(path, path[ends]), first + 1)  # where the camera rests: the first pose there
+    nearer = np.abs(path[ends[0]] - wanted) <= np.abs(path[ends[1]] - wanted)
+    second = np.where(nearer, ends[0], ends[1])
+    near = np.abs(path[second] - wanted) <= slack_ratio * distance
+    return first[near], second[near]
+
+
+def _rpe_of_pairs(poses: Array, true_poses: Array, first: Array, second: Array) -> RpeResult:
+    moved = np.linalg.inv(poses[first]) @ poses[second]
+    truly_moved = np.linalg.inv(true_poses[first]) @ true_poses[second]
     error = np.linalg.inv(truly_moved) @ moved
     length = np.linalg.norm(error[:, :3, 3], axis=1)
     angle = rotation_angle_rad(error[:, :3, :3])

@@ -25,7 +25,7 @@ from .trajectory_files import write_tum
 Array = NDArray[Any]
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "metrics.json", "report.html",
+    "metrics.json", "report.html", "aligned.txt",
 )  # fmt: skip
 FOLDERS = ("masks", "renders")
 RESERVE_BYTES = 2**20  # given back when the disk is full, so that the end of a run can still be written
@@ -124,6 +124,12 @@ class RunFolder:
                 raise OutputError(f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not")
             image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
         self._write_png("renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
+
+    def write_aligned(self, rows: Array) -> None:
+        """aligned.txt: (n, 7) time, estimated position in the truth's frame, true position; for plots."""
+        lines = [f"{row[0]:.6f} " + " ".join(f"{v:.6f}" for v in row[1:]) + "\n" for row in rows]
+        head = "# timestamp_s x y z true_x true_y true_z (truth's frame and unit, after Sim(3) alignment)\n"
+        write_text(self.path / "aligned.txt", head + "".join(lines))
 
     def write_metrics(self, metrics: dict[str, Any]) -> None:
         """metrics.json: flat keys."""

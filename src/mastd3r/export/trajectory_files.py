@@ -1,18 +1,20 @@
-"""TUM trajectory files: ``timestamp tx ty tz qx qy qz qw``. The only place that knows xyzw quaternions."""
+"""Trajectory files: TUM's ``timestamp tx ty tz qx qy qz qw``, which we write, and those that other systems write."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import ConfigError, InputError
 from ..types import State, Trajectory
 from .files import write_text
 
 Array = NDArray[Any]
+TrajectoryKind = Literal["tum", "kitti", "euroc"]
+NOT_A_ROTATION = 0.01  # largest entry of R^T R - 1 that rounding in a file may leave
 HEADER = "# timestamp_s tx ty tz qx qy qz qw (world_from_cam)\n"
 
 
@@ -33,27 +35,83 @@ def read_tum(path: Path, state: State = "tracked") -> Trajectory:
 
     Raises InputError for a missing file, a row that is not eight numbers, or a quaternion of length 0.
     """
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError as e:
-            raise InputError(f"{path} line {number}: expected numbers, got {line[:60]!r}") from e
+    for number, line in _lines(path):
+        row = _floats(path, number, line, line.split())
         if len(row) != 8 or not any(row[4:]):
             raise InputError(f"{path} line {number}: expected t tx ty tz qx qy qz qw, got {line[:60]!r}")
         rows.append(row)
     data = np.array(rows, float).reshape(-1, 8)
-    data = data[np.argsort(data[:, 0], kind="stable")]
-    poses = np.tile(np.eye(4), (len(data), 1, 1))
-    poses[:, :3, 3] = data[:, 1:4]
-    poses[:, :3, :3] = rotation_from_quaternion(data[:, [7, 4, 5, 6]])
-    return Trajectory(data[:, 0], poses, (state,) * len(data), np.zeros(len(data), bool))
+    return _in_order(data[:, 0], data[:, 1:4], rotation_from_quaternion(data[:, [7, 4, 5, 6]]), state)
+
+
+def read_trajectory(path: Path, kind: TrajectoryKind, times_s: Array) -> Trajectory:
+    """Another system's trajectory: poses of the camera in the world (world_from_cam), OpenCV axes.
+
+    tum: eight numbers a row. kitti: twelve, the top of world_from_cam; row n belongs to frame n, whose time is
+    ``times_s[n]`` (n,). euroc: commas, time in nanoseconds, position, quaternion wxyz; further columns are not read.
+    Raises ConfigError for another kind, InputError for a file that is missing or not of its kind.
+    """
+    if kind not in get_args(TrajectoryKind):
+        raise ConfigError(f"trajectory format: expected one of {', '.join(get_args(TrajectoryKind))}, got {kind!r}")
+    read = {"tum": read_tum, "kitti": lambda p: _read_kitti(p, times_s), "euroc": _read_euroc}[kind]
+    found = read(path)
+    if not len(found.timestamps_s):
+        raise InputError(f"{path}: expected poses, got none")
+    return found
+
+
+def _read_kitti(path: Path, times_s: Array) -> Trajectory:
+    rows: list[list[float]] = []
+    for number, line in _lines(path):
+        row = _floats(path, number, line, line.split())
+        if len(row) != 12:
+            raise InputError(f"{path} line {number}: expected the 12 numbers of a KITTI pose, got {len(row)}")
+        turn = np.array(row).reshape(3, 4)[:, :3]
+        if not np.abs(turn.T @ turn - np.eye(3)).max() < NOT_A_ROTATION:
+            raise InputError(f"{path} line {number}: expected a rotation and a position, got {line[:60]!r}")
+        rows.append(row)
+    if len(rows) != len(times_s):
+        raise InputError(
+            f"{path}: expected a row for each of the {len(times_s)} frames, as KITTI rows have no time, got {len(rows)}"
+        )
+    data = np.array(rows, float).reshape(-1, 3, 4)
+    return _in_order(np.asarray(times_s, float), data[:, :, 3], data[:, :, :3], "tracked")
+
+
+def _read_euroc(path: Path) -> Trajectory:
+    rows: list[list[float]] = []
+    for number, line in _lines(path):
+        row = _floats(path, number, line, line.rstrip(", \t").split(","))
+        if len(row) < 8 or not any(row[4:8]):
+            raise InputError(f"{path} line {number}: expected t_ns,x,y,z,qw,qx,qy,qz, got {line[:60]!r}")
+        rows.append(row[:8])
+    data = np.array(rows, float).reshape(-1, 8)
+    return _in_order(data[:, 0] * 1e-9, data[:, 1:4], rotation_from_quaternion(data[:, 4:]), "tracked")
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """(number from 1, text) of every line that is neither empty nor a comment."""
+    try:
+        lines = path.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as e:
+        raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
+    return [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+
+
+def _floats(path: Path, number: int, line: str, words: list[str]) -> list[float]:
+    try:
+        return [float(word) for word in words]
+    except ValueError as e:
+        raise InputError(f"{path} line {number}: expected numbers, got {line[:60]!r}") from e
+
+
+def _in_order(times_s: Array, positions: Array, rotations: Array, state: State) -> Trajectory:
+    """Poses (n, 4, 4) of their parts, in order of time; no keyframe among them."""
+    order = np.argsort(times_s, kind="stable")
+    poses = np.tile(np.eye(4), (len(order), 1, 1))
+    poses[:, :3, 3], poses[:, :3, :3] = positions[order], rotations[order]
+    return Trajectory(times_s[order], poses, (state,) * len(order), np.zeros(len(order), bool))
 
 
 def quaternion_from_rotation(rotation: Array) -> Array:

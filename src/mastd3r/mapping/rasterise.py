@@ -13,6 +13,13 @@ def torch_device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
+def accelerator() -> tuple[str, float] | None:
+    """Name of the accelerator and the most of its memory that tensors have held, in MiB; None without one."""
+    if torch_device() == "cpu":
+        return None
+    return torch.cuda.get_device_name(), torch.cuda.max_memory_allocated() / 2**20
+
+
 def rasterization(
     means: torch.Tensor,
     quats: torch.Tensor,
