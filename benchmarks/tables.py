@@ -16,6 +16,8 @@ from typing import Any
 from mastd3r.experiments.plots import plots_of
 from mastd3r.experiments.render import as_markdown
 from mastd3r.experiments.store import read_results
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 from networks_table import networks
 
 COLUMNS: dict[str, tuple[str, str]] = {
