@@ -2,7 +2,7 @@
 
 usage: python benchmarks/tables.py results.json docs/results.md
 
-Beside results.json: endurance.json, reference.json, and in bench/ the results.json of each bench under its suite's
+Beside results.json: endurance.json, corrections.json, networks.json, reference.json, and in bench/ the results.json of each bench under its suite's
 name. Plots go into a folder plots beside the page.
 """
 
@@ -18,6 +18,7 @@ from mastd3r.experiments.render import as_markdown
 from mastd3r.experiments.store import read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+from corrections_table import corrections
 from networks_table import networks
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -75,6 +76,7 @@ def main() -> int:
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     lines += experiments(source.parent / "bench", target.parent / "plots")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
+    lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mastd3r.alignment.align import align
 from mastd3r.alignment.coarse import icp, resect
-from mastd3r.alignment.fine import align_fine, chamfer_pairs, point_terms
+from mastd3r.alignment.fine import OwnPoints, align_fine, chamfer_pairs, point_terms
 from mastd3r.alignment.reproject import StaticMatches, solve_pose
 from mastd3r.alignment.result import Alignment
 from mastd3r.alignment.scale import correct_scale, patch_scale
@@ -248,3 +248,19 @@ def test_nonsense_matches_are_not_believed(scene: Any) -> None:
         found = pair.align(correction)
         assert np.isfinite(found.new_from_ref).all()
         assert found.inlier_ratio < 0.35  # tracking.min_inlier_ratio
+
+
+def test_the_fine_stage_as_printed_sees_points_alone_and_keeps_the_scale(scene: Any) -> None:
+    """Eq. (11)(12): T in SE(3), residuals in space. Matches that lie all to one side pull ours, not the printed one."""
+    pair = Pair(scene)
+    shifted = replace(pair.matches, target=pair.matches.target + np.array([4.0, 0.0]))
+    own = OwnPoints(pair.ref, pair.own, pair.weight, SIGMA_RATIO)
+    start = se3_exp(np.array([0.01, -0.01, 0.02, 0.01, 0.0, -0.01])) @ pair.truth
+    printed, scale = align_fine(shifted, own, start, 1.0, chamfer_weight=0.1, as_printed=True)
+    ours, _ = align_fine(shifted, own, start, 1.0, chamfer_weight=0.1)
+    assert pair.error(printed.new_from_ref) < 1e-3 < 0.2 * pair.error(ours.new_from_ref)
+    larger = replace(own, new=1.02 * own.new)
+    printed, scale = align_fine(pair.matches, larger, start, 1.0, chamfer_weight=0.1, as_printed=True)
+    assert scale == 1.0 and pair.error(printed.new_from_ref) > 5e-3
+    _, scale = align_fine(pair.matches, larger, start, 1.0, chamfer_weight=0.1)
+    assert scale == pytest.approx(1 / 1.02, rel=2e-3)
