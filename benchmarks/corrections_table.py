@@ -31,8 +31,8 @@ def corrections(path: Path) -> list[str]:
         f"{data['made']['date']}, commit {data['made']['git_commit']}. "
         f"Sensor depth of {about['sequence']}, first {about['frames']} frames, each with a scale of its own "
         f"({errors['scale']:.0%}), bent ({errors['bend']:.0%}) and blurred over edges ({errors['bleed_px']:g} px), "
-        f"{len(seeds)} seeds. ATE of the path as tracked, Sim(3), without the joint optimisation: mean [least, most] in "
-        "metres. `as printed`: eq. (11)(12) with residuals in space alone, on SE(3).",
+        f"{len(seeds)} seeds. ATE of the path as tracked, Sim(3), without the joint optimisation: mean [least, most] "
+        "in metres. `as printed`: eq. (11)(12) with residuals in space alone, on SE(3).",
         "",
         "| fine stage | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
