@@ -87,7 +87,8 @@ class Slam:
         prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
         if self._ref is None:
             return self._start(work, prior, "first view")
-        kf, view = self._ref, self._find(work, prior)
+        view = self._find(work, prior)  # may change what is followed
+        kf = self._ref
         if view is None:
             kf, view = self._retry(work, prior)
         if view is None:
