@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, NetworksConfig
+from .dynamics.head import plain_descriptors
 from .errors import ConfigError, InputError
 from .graph.places import PlaceIndex
 from .networks import weights
@@ -19,6 +20,7 @@ from .pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, workin
 from .types import Frame, Source, WorkFrame
 
 Array = NDArray[Any]
+DESCRIBED_PX = 4  # working pixels a plain descriptor
 
 
 @dataclass
@@ -32,6 +34,7 @@ class Parts:
     notes: list[str] = field(default_factory=list)
     semantic: Callable[[Frame], Frame] | None = None  # fills Frame.semantic; None: what the source brings
     own_scale_known: bool = True  # False: the depth of every frame alone has a scale of its own
+    descriptors: Callable[[Frame], Array] | None = None  # (h', w', c) of a network; None: plain descriptors
 
     def __post_init__(self) -> None:
         width, height = self.size
@@ -41,6 +44,13 @@ class Parts:
     def observe(self, frame: Frame, near: WorkFrame | None = None) -> WorkFrame:
         """The frame with its semantic prior, as the provider sees it; ``near`` sees the same place."""
         return self.provider.observe(frame if self.semantic is None else self.semantic(frame), near)
+
+
+    def describe(self, frame: Frame) -> Array:
+        """(h', w', c) float32 descriptors of a frame, for the head that learns what moving things look like."""
+        if self.descriptors is not None:
+            return self.descriptors(frame)
+        return plain_descriptors(frame.image, self.size[0] // DESCRIBED_PX, self.size[1] // DESCRIBED_PX)
 
 
 def build_parts(config: Config, source: Source) -> Parts:
@@ -58,7 +68,7 @@ def build_parts(config: Config, source: Source) -> Parts:
         provider_class = SensorDepthPointmaps if kind == "depth" else GeometricPointmaps
         parts = Parts(provider_class(width, height, config.tracking.cell_px), (width, height))
     if prior == "dinov2":
-        parts.semantic, note = _dinov2(config.networks)
+        parts.semantic, parts.descriptors, note = _dinov2(config.networks)
         parts.notes.append(note)
     parts.notes[:0] = notes
     return parts
@@ -128,17 +138,24 @@ def _mast3r(config: Config, source: Source) -> Parts:
     return Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)
 
 
-def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:
-    """What gives a frame its P(foreground), with a memory over the video, and a line about it."""
+def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], Callable[[Frame], Array], str]:
+    """What gives a frame its P(foreground), with a memory over the video; its features; and a line about it."""
     path = weights.path(config.dinov2)
     from .networks.dinov2 import Dinov2Features
     from .networks.foreground import ForegroundPrior
 
     device = _device()
     precision = _precision(config, device)
-    features, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    network, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    last: dict[int, Array] = {}  # the network is asked once a frame
+
+    def features(frame: Frame) -> Array:
+        if frame.index not in last:
+            last.clear()
+            last[frame.index] = network.one(frame.image).features
+        return last[frame.index]
 
     def fill(frame: Frame) -> Frame:
-        return replace(frame, semantic=prior(features.one(frame.image).features))
+        return replace(frame, semantic=prior(features(frame)))
 
-    return fill, f"DINOv2: {config.dinov2}, {precision} on {device}"
+    return fill, features, f"DINOv2: {config.dinov2}, {precision} on {device}"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, config_to_yaml
+from .dynamics.data import DynamicMask
 from .errors import InputError, SlamError
 from .evaluation.evaluate import evaluate
 from .evaluation.image_error import psnr
@@ -30,7 +31,7 @@ from .mapping.ply import write_gaussians_ply
 from .parts import build_parts
 from .progress import Reporter, Silent
 from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
-from .second_pass import SecondPass, second_pass
+from .second_pass import Look, SecondPass, second_pass
 from .slam import Slam
 from .sources import open_source
 from .types import Source, StaticCloud
@@ -202,20 +203,14 @@ class _Job:
     def _look_again(self, lens_view: LensView) -> SecondPass:
         with self.reporter.stage("masks", len(self._final), "frames") as bar:
 
-            def on_mask(timestamp_s: float, moving: Array) -> None:
+            def on_mask(timestamp_s: float, _mask: DynamicMask, moving: Array) -> None:
                 self.folder.write_mask(timestamp_s, moving)
                 bar.advance()
 
-            return second_pass(
-                self.source.frames(),
-                self._final,
-                self.slam.graph,
-                self.slam.parts,
-                self.config,
-                lens_view,
-                on_mask,
-                self.rectifier,
-            )
+            slam = self.slam
+            head = slam.belief.head
+            look = Look(self._final, slam.graph, slam.parts, self.config, lens_view, self.rectifier, head)
+            return second_pass(self.source.frames(), look, on_mask)
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
         mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed)

@@ -84,7 +84,8 @@ class Slam:
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
-        prior = grown(self.belief.prior(work.gray, work.semantic))  # III-A, prior of (2)
+        features = self.parts.describe(frame) if self.config.dynamics.use_head else None
+        prior = grown(self.belief.prior(work.gray, work.semantic, features))  # III-A, prior of (2)
         if self._ref is None:
             return self._start(work, prior, "first view")
         view = self._find(work, prior)  # may change what is followed
@@ -93,7 +94,7 @@ class Slam:
             kf, view = self._retry(work, prior)
         if view is None:
             return self._start_again(work, prior)
-        moving = self._update_belief(work, kf, view, prior)  # III-A, (2)(3)
+        moving = self._update_belief(work, kf, view, prior, features)  # III-A, (2)(3)
         self.graph.record(work, kf.id, view.alignment.new_from_ref, "tracked", view.pair.matches, view.weight)
         self._follow(kf, view, self._most_matched if kf is self._ref else 0)
         self._last = (work, moving)
@@ -305,11 +306,13 @@ class Slam:
             self._chain[i, j] = pair.flow
         return self.graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
 
-    def _update_belief(self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Array) -> Array:
+    def _update_belief(
+        self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Array, features: Array | None
+    ) -> Array:
         if not self.graph.initialised:
             return prior
         cam_from_world = view.alignment.new_from_ref @ self.graph.blocks[kf.id].cam_from_world
-        given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
+        given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale, features)
         return grown(self.belief.update(given).probability)
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
