@@ -45,7 +45,6 @@ class Parts:
         """The frame with its semantic prior, as the provider sees it; ``near`` sees the same place."""
         return self.provider.observe(frame if self.semantic is None else self.semantic(frame), near)
 
-
     def describe(self, frame: Frame) -> Array:
         """(h', w', c) float32 descriptors of a frame, for the head that learns what moving things look like."""
         if self.descriptors is not None:

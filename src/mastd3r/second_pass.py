@@ -18,6 +18,7 @@ from .dynamics.two_way import TwoWayBelief
 from .finish import FinalFrame, kept_matches
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
+from .graph.point_votes import PointVotes
 from .lens_view import LensView
 from .parts import Parts
 from .rectify import Rectifier
@@ -33,7 +34,7 @@ class SecondPass:
 
     views: list[View] = field(default_factory=list)  # for the map; no holdout frame among them
     colors: dict[int, Array] = field(default_factory=dict)  # kf id -> (p, 3) uint8 at its px; no holdout frame
-    moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px
+    moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px, by all frames
     holdout: list[FinalFrame] = field(default_factory=list)
 
 
@@ -65,14 +66,23 @@ class Look:
     head: OnlineHead | None = None  # what tracking learned of the looks of moving things
 
 
-def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[float, DynamicMask, Array], None]) -> SecondPass:
+@dataclass(frozen=True)
+class SeenMask:
+    """One frame's mask, as it comes."""
+
+    timestamp_s: float
+    image: Array  # (h, w, 3) uint8 RGB at working size, as tracking saw it
+    mask: DynamicMask  # over the image
+    over_photograph: Array  # (h, w) float32 P(moving) over the photograph at working scale
+
+
+def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask], None]) -> SecondPass:
     """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``.
 
     ``frames`` are photographs, and ``lens_view`` is of their lens. Where that was calibrated, ``rectifier`` makes
-    them what tracking saw. ``on_mask`` is given the frame's time, its mask, and P(moving), (h, w) float32 over the
-    photograph at working scale. A mask waits for frames after it, so a few frames are held, never the video.
+    them what tracking saw. A mask waits for frames after it, so a few frames are held, never the video.
     """
-    out, waiting = SecondPass(), deque[_Waiting]()
+    out, waiting, votes = SecondPass(), deque[_Waiting](), PointVotes()
     graph, parts, lens_view = look.graph, look.parts, look.lens_view
     chosen = _view_positions(look.final, look.config)
     belief = TwoWayBelief(look.config.dynamics, *parts.size, look.head or OnlineHead(look.config.dynamics))
@@ -81,26 +91,30 @@ def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[float, D
         one = waiting.popleft()
         place = one.place
         moving = _over_photograph(mask.probability, look.rectifier)
-        on_mask(place.record.timestamp_s, mask, moving)
+        on_mask(SeenMask(place.record.timestamp_s, one.small, mask, moving))
         if place.record.is_keyframe:
             uncoloured.append(place.record.kf_id)
         if is_holdout(one.position):
             out.holdout.append(place)
             continue
         for kf_id in uncoloured:  # a holdout keyframe takes its colours from the frame after it
-            out.colors[kf_id], out.moving[kf_id] = _seen_by(one.small, mask.probability, graph, kf_id, place)
+            out.colors[kf_id], p, _ = _seen_by(one.small, mask.probability, graph, kf_id, place)
+            votes.start(kf_id, p, out.colors[kf_id])
         uncoloured.clear()
+        kf_id = place.record.kf_id
+        if kf_id in out.colors and not place.record.is_keyframe:
+            colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
+            votes.add(kf_id, p, colors, inside)
         if one.photograph is not None:
             uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
             if uncertainty is not None:
                 uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
             out.views.append(_view(one.photograph, place, moving, uncertainty, lens_view))
+    out.moving = votes.moving()
     return out
 
 
-def _inputs(
-    frames: Iterator[Frame], look: Look, chosen: set[int], waiting: deque[_Waiting]
-) -> Iterator[DynamicsInput]:
+def _inputs(frames: Iterator[Frame], look: Look, chosen: set[int], waiting: deque[_Waiting]) -> Iterator[DynamicsInput]:
     """What the mask is told of each frame; what is needed once the mask is there goes to ``waiting``."""
     by_index = {f.record.index: f for f in look.final}
     graph, parts = look.graph, look.parts
@@ -137,8 +151,13 @@ def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
     return {usable[int(i)] for i in np.linspace(0, len(usable) - 1, most).round()} if most else set()
 
 
-def _seen_by(small: Array, moving: Array, graph: KeyframeGraph, kf_id: int, place: FinalFrame) -> tuple[Array, Array]:
-    """Colours (p, 3) uint8 and P(moving) (p,) of a keyframe's points in a frame's image; outside counts as moving."""
+def _seen_by(
+    small: Array, moving: Array, graph: KeyframeGraph, kf_id: int, place: FinalFrame
+) -> tuple[Array, Array, Array]:
+    """Colours (p, 3) uint8 and P(moving) (p,) of a keyframe's points in a frame's image, and (p,) bool: inside it.
+
+    Outside counts as moving.
+    """
     block, camera = graph.blocks[kf_id], graph.camera()
     if place.record.is_keyframe and place.record.kf_id == kf_id:
         px = block.px
@@ -149,7 +168,7 @@ def _seen_by(small: Array, moving: Array, graph: KeyframeGraph, kf_id: int, plac
         px = np.where(in_front[:, None], camera.project(np.where(in_front[:, None], points, 1.0)), -1e3)
     inside = (px > -0.5).all(1) & (px[:, 0] < camera.width - 0.5) & (px[:, 1] < camera.height - 0.5)
     at = np.clip(np.round(px), 0, [camera.width - 1, camera.height - 1]).astype(int)
-    return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0)
+    return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0), inside
 
 
 def _over_photograph(values: Array, rectifier: Rectifier | None) -> Array:
