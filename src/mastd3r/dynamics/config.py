@@ -20,6 +20,7 @@ class DynamicsConfig:
     use_time: bool = True  # (d) the last belief, carried along the flow
     use_head: bool = True  # (e) looks of what moved in this video, learned online
     use_future: bool = True  # second pass: frames after this one are evidence too
+    use_doubt: bool = True  # evidence weakens where the static majority fits worse than pose and depths claim
     use_regions: bool = True  # pooling of the belief inside image edges
     memory: float = 0.85  # share of the carried log-odds that is kept from one frame to the next
     evidence_gain: float = 1.0  # weight of one frame's log ratios
@@ -29,7 +30,7 @@ class DynamicsConfig:
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
     gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with while tracking
     second_gaps: tuple[int, ...] = (1, 4, 12)  # frames back and forth, in the second pass; the last is its delay
-    head_share: float = 0.5  # weight of the head's log-odds
+    head_share: float = 1.0  # weight of the head's log-odds
     head_limit: float = 4.0  # its log-odds are bounded by this
     head_memory: float = 0.99  # share of what it knows that is kept from one frame to the next
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture

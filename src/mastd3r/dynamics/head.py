@@ -1,13 +1,14 @@
 """What the moving things of this video look like: a small Bayesian classifier, learned online from motion (III-A).
 
 Logistic regression on random Fourier features (Rahimi, Recht 2007) of any dense descriptors: DINOv2 tokens, or plain
-ones. It is taught by the geometric evidence alone, never by its own answers, and no class list is needed. The weights
+ones. It is taught by the geometric evidence, and no class list is needed. The weights
 are a Gaussian that every frame sharpens (a Newton step of the log posterior; old frames are forgotten slowly), so that
 what was never seen is answered by "unknown": 0.
 """
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import cv2
@@ -20,6 +21,7 @@ Array = NDArray[Any]
 WAVES = 64  # random features beside the descriptors themselves
 SAMPLES = 400  # pixels that one frame teaches
 SURE_LOG_ODDS = 3.0  # evidence from which a pixel teaches with full weight
+STANDING_SHARE = 0.5  # how often a thing that can move is seen to stand: one such look says only so much
 PRIOR_INFO = 4.0  # of every weight, in pixels' worth
 FRAME_SHARE = 0.2  # pixels of a frame repeat one another: each counts for so much
 
@@ -31,9 +33,13 @@ class OnlineHead:
         self.config = config
         self._rng = np.random.default_rng(1)
         self._centre = self._scale = self._waves = self._phase = np.zeros(0, np.float32)
-        self._weights = np.zeros(0)
+        self._weights = self._start = np.zeros(0)
         self._info = np.zeros((0, 0))
         self._moving_seen = 0.0  # samples that moved
+
+    def copy(self) -> OnlineHead:
+        """What it knows now; either may learn on without the other."""
+        return deepcopy(self)
 
     def learn(self, features: Array, log_odds: Array) -> None:
         """One frame: ``features`` (h', w', c), and the geometric evidence (h, w) as log-odds without a prior."""
@@ -41,12 +47,13 @@ class OnlineHead:
         target = cv2.resize(log_odds, size, interpolation=cv2.INTER_AREA).reshape(-1).astype(np.float64)
         at = self._rng.integers(0, len(target), SAMPLES)
         sure = np.minimum(np.abs(target[at]) / SURE_LOG_ODDS, 1) ** 2
-        label = 1 / (1 + np.exp(-target[at]))
         cells = features.reshape(-1, features.shape[2]).astype(np.float32)
         if len(self._weights) == 0 or len(self._centre) != features.shape[2]:
             self._begin(cells)
         z = self._lifted(cells[at]).astype(np.float64)
-        self._moving_seen += float((sure * label).sum())
+        said = np.clip(target[at], np.log(STANDING_SHARE), SURE_LOG_ODDS)
+        label = 1 / (1 + np.exp(-(z @ self._weights + said)))  # what may move is not refuted by standing
+        self._moving_seen += float((target[at] > SURE_LOG_ODDS).sum())
         forget = self.config.head_memory
         prior = PRIOR_INFO * np.eye(len(self._weights))
         old, kept = self._weights.copy(), forget * self._info + (1 - forget) * prior
@@ -55,13 +62,15 @@ class OnlineHead:
             curved = FRAME_SHARE * sure * np.maximum(p * (1 - p), 1e-3)
             info = kept + (z * curved[:, None]).T @ z
             slope = z.T @ (FRAME_SHARE * sure * (label - p)) - kept @ (self._weights - old)
-            self._weights = self._weights + np.linalg.solve(info, slope - (1 - forget) * PRIOR_INFO * old)
+            self._weights = self._weights + np.linalg.solve(
+                info, slope - (1 - forget) * PRIOR_INFO * (old - self._start)
+            )
         self._info = info
 
     def log_odds(self, features: Array) -> Array | None:
         """(h', w') float32 log-odds of moving by looks alone; None before anything was seen to move.
 
-        Shrunk towards 0 where the weights are unsure (MacKay's approximation), bounded by ``head_limit``.
+        Beyond the base rate. Shrunk where the weights are unsure (MacKay's approximation), bounded by ``head_limit``.
         """
         if self._moving_seen < SAMPLES / 4 or len(self._centre) != features.shape[2]:
             return None
@@ -70,6 +79,7 @@ class OnlineHead:
         variance = ((z @ spread) ** 2).sum(1)
         value = z @ self._weights.astype(np.float32) / np.sqrt(1 + np.pi / 8 * variance)
         limit = self.config.head_limit
+        value = value - np.float32(self._start[0])
         return np.clip(value, -limit, limit).reshape(features.shape[:2]).astype(np.float32)
 
     def _begin(self, cells: Array) -> None:
@@ -80,7 +90,9 @@ class OnlineHead:
         self._waves = (rng.normal(size=(channels, WAVES)) * 1.5 / np.sqrt(channels)).astype(np.float32)
         self._phase = rng.uniform(0, 2 * np.pi, WAVES).astype(np.float32)
         n = 1 + min(channels, WAVES) + WAVES
-        self._weights, self._info = np.zeros(n), PRIOR_INFO * np.eye(n)
+        self._start = np.zeros(n)
+        self._start[0] = np.log(self.config.base_rate / (1 - self.config.base_rate))
+        self._weights, self._info = self._start.copy(), PRIOR_INFO * np.eye(n)
         self._moving_seen = 0.0
 
     def _lifted(self, cells: Array) -> Array:

@@ -29,7 +29,10 @@ class Outline:
         c = self.config
         if looks is not None:
             reach = cv2.resize(looks, (self.w, self.h), interpolation=cv2.INTER_LINEAR)
-            belief = np.clip(belief + c.head_share * reach, -c.max_log_odds, c.max_log_odds)
+            # what looks like a thing that moved is no part of the map, also while it stands still
+            doubt = np.clip(1 - reach / (0.6 * c.head_limit), 0, 1)
+            belief = np.maximum(belief, 0) + doubt * np.minimum(belief, 0) + c.head_share * reach
+            belief = np.clip(belief, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(belief, gray, semantic, sharp)
         if semantic is not None and c.use_semantic:
             shown = c.semantic_share * shown
