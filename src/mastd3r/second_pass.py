@@ -129,6 +129,7 @@ def _inputs(frames: Iterator[Frame], look: Look, chosen: set[int], waiting: dequ
         waiting.append(_Waiting(position, place, small, photograph))
         features = parts.describe(seen) if look.config.dynamics.use_head else None
         given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0, features)
+        given = replace(given, color=small)
         yield given if parts.own_scale_known else _at_expected_scale(given)
 
 

@@ -22,6 +22,7 @@ from .outline import Outline, sigmoid
 from .photo import mismatch, photo_variance
 
 Array = NDArray[Any]
+HELD_LOG_ODDS = 2.0  # of belief and of looks, from which a thing that stops is held to be the same
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ class DynamicBelief:
         arrival = self._arrive(given.gray, given.features)
         fresh, carried, evidence = self._evidence(given, arrival)
         limit = self.config.max_log_odds
+        carried, fresh = held(carried, fresh, arrival.looks, self.config)
         belief = np.clip(carried + self.config.evidence_gain * fresh, -limit, limit).astype(np.float32)
         if self.config.use_head and given.features is not None:
             self.head.learn(given.features, belief)
@@ -138,6 +140,18 @@ def with_depth(fresh: Array, depth: Array) -> Array:
     return np.maximum(fresh, 0) + doubt * np.minimum(fresh, 0) + depth
 
 
+def held(carried: Array, fresh: Array, looks: Array | None, config: DynamicsConfig) -> tuple[Array, Array]:
+    """(carried, fresh) where what was seen to move, and looks like what moves, is not refuted by standing still.
+
+    Both must hold: a parked car of the same looks was never seen to move, and is judged by its own evidence.
+    """
+    if looks is None:
+        return carried, fresh
+    hold = np.clip(carried / HELD_LOG_ODDS, 0, 1) * np.clip(_resized(looks, carried) / HELD_LOG_ODDS, 0, 1)
+    unforgotten = carried * (1 + hold * np.float32(1 / config.memory - 1))
+    return unforgotten, np.maximum(fresh, 0) + (1 - hold) * np.minimum(fresh, 0)
+
+
 def check_input(outline: Outline, given: DynamicsInput) -> None:
     """Raises InputError for images of another size."""
     for name in ("gray", "inv_depth", "inv_depth_sigma", "own_inv_depth"):
@@ -149,7 +163,7 @@ def shown_mask(
     outline: Outline, belief: Array, given: DynamicsInput, looks: Array | None, terms: dict[str, Array]
 ) -> DynamicMask:
     """The mask of a belief (log-odds, half size), with the semantics and the looks that the frame has."""
-    p = outline.probability(belief, given.gray, given.semantic, looks, terms.get("depth"))
+    p = outline.probability(belief, given, looks, terms.get("depth"))
     if given.semantic is not None and outline.config.use_semantic:
         terms["semantic"] = outline.semantic_log_odds(given.semantic)
     if looks is not None:

@@ -30,7 +30,7 @@ class DynamicsConfig:
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
     gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with while tracking
     second_gaps: tuple[int, ...] = (1, 4, 12)  # frames back and forth, in the second pass; the last is its delay
-    head_share: float = 1.0  # weight of the head's log-odds
+    head_share: float = 0.5  # weight of the head's log-odds
     head_limit: float = 4.0  # its log-odds are bounded by this
     head_memory: float = 0.99  # share of what it knows that is kept from one frame to the next
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
@@ -49,6 +49,9 @@ class DynamicsConfig:
     region_px: float = 20.0  # reach of the pooling where there is no edge
     region_contrast: float = 15.0  # grey levels that are as far as region_px
     semantic_contrast: float = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
+    chroma_gain: float = 1.5  # a step of colour against one of grey, for outlines
+    fine_px: float = 8.0  # reach of the last step at full size, where there is colour
+    fine_contrast: float = 12.0  # grey levels that are as far as fine_px
     edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
     edge_contrast: float = 30.0  # grey levels that it takes for an edge
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth

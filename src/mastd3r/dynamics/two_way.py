@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .belief import check_input, kept_share, shown_mask, with_depth, without_motion
+from .belief import check_input, held, kept_share, shown_mask, with_depth, without_motion
 from .compare import Comparison, MotionTest, Past
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
@@ -32,6 +32,7 @@ class _Seen:
     texture: Information
     motion: Array  # (h, w) log ratios so far
     depth: Array | None  # (h, w) log ratio of its own depth
+    looks: Array | None  # (h', w') log-odds of the head
     flow: dict[int, Array] = field(default_factory=dict)  # -1: to the frame before, 1: to the frame after
     kept: dict[int, Array] = field(default_factory=dict)  # share of a belief that survives that way
 
@@ -77,7 +78,10 @@ class TwoWayBelief:
         depth = None
         if self.config.use_depth and given.own_inv_depth is not None:
             depth = self.outline.shrink(depth_log_ratio(given, self.config))
-        new = _Seen(given, Past(small, given.world_from_cam, self._nothing), texture, self._nothing, depth)
+        looks = None
+        if self.config.use_head and given.features is not None and self.head is not None:
+            looks = self.head.log_odds(given.features)
+        new = _Seen(given, Past(small, given.world_from_cam, self._nothing), texture, self._nothing, depth, looks)
         before = list(self._window)
         gaps = sorted({min(g, len(before)) for g in self.config.second_gaps} - {0})
         if before:
@@ -89,7 +93,7 @@ class TwoWayBelief:
                     self._against(new, before[-gap], 1 - sigmoid(carried), -gap)
         else:
             carried = self._nothing
-        self._causal = self._added(carried, new.fresh())
+        self._causal = self._added(carried, new)
         new.past = Past(small, given.world_from_cam, self._moving(new, self._causal))
         self._window.append(new)
         if self.config.use_future and self.config.use_motion:
@@ -106,13 +110,13 @@ class TwoWayBelief:
         """The mask of the oldest frame, which has seen all it will see."""
         seen, config = self._window[0], self.config
         before = self._nothing if self._forward is None else self._carried(self._forward, seen, -1)
-        self._forward = self._added(before, seen.fresh())
+        self._forward = self._added(before, seen)
         after = self._after()
-        belief = self._added(before + after, seen.fresh())
+        belief = self._added(before + after, seen)
         terms = {"motion": seen.motion, "time": (before + after).astype(np.float32)}
         if seen.depth is not None:
             terms["depth"] = seen.depth
-        features, looks = seen.given.features, None
+        features, looks = seen.given.features, seen.looks
         if config.use_head and features is not None and self.head is not None:
             self.head.learn(features, belief)
             looks = self.head.log_odds(features)
@@ -125,7 +129,7 @@ class TwoWayBelief:
         if not self.config.use_future:
             return back
         for n in range(len(self._window) - 1, 0, -1):
-            back = self._carried(self._added(back, self._window[n].fresh()), self._window[n - 1], 1)
+            back = self._carried(self._added(back, self._window[n]), self._window[n - 1], 1)
         return back
 
     def _carried(self, belief: Array, to: _Seen, way: int) -> Array:
@@ -137,7 +141,8 @@ class TwoWayBelief:
     def _kept(self, one: _Seen, other: _Seen, flow: Array) -> Array:
         return kept_share(self.config, self._flow, one.past.gray, other.past.gray, flow, one.texture)
 
-    def _added(self, carried: Array, fresh: Array) -> Array:
+    def _added(self, carried: Array, seen: _Seen) -> Array:
+        carried, fresh = held(carried, seen.fresh(), seen.looks, self.config)
         limit = self.config.max_log_odds
         return np.clip(carried + self.config.evidence_gain * fresh, -limit, limit).astype(np.float32)
 
