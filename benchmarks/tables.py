@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from masks_tables import masks
+
 COLUMNS: dict[str, tuple[str, str]] = {
     "frames_posed": ("posed", "d"),
     "frames": ("of", "d"),
@@ -64,6 +66,7 @@ def main() -> int:
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
+    lines += masks(source.parent / "masks.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
 
