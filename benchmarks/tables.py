@@ -19,6 +19,7 @@ from mastd3r.experiments.store import read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
+from masks_tables import masks
 from networks_table import networks
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -78,6 +79,7 @@ def main() -> int:
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")
+    lines += masks(source.parent / "masks.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
 

@@ -77,7 +77,7 @@ HEAVY = {  # package: who may import it
     "transformers": {"networks"},
     "safetensors": {"networks"},
     "gsplat": {"mapping"},
-    "av": {"sources"},
+    "av": {"sources", "export"},  # read videos, write masks.mp4
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights", "cli_bench", "cli_download"},
 }

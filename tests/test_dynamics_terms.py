@@ -11,6 +11,7 @@ from mastd3r.dynamics.data import DynamicsInput
 from mastd3r.dynamics.depth import depth_log_ratio
 from mastd3r.dynamics.motion import (
     along_epipolar,
+    doubt_of_fit,
     flow_covariance,
     motion_log_ratio,
     pose_jacobian,
@@ -157,3 +158,28 @@ def test_guided_line_recovers_an_affine_image_exactly() -> None:
     guide = rng.uniform(0, 255, (40, 50)).astype(np.float32)
     a, b = guided_coefficients(guide, 0.02 * guide - 1, np.ones_like(guide), 5, 1.0)
     np.testing.assert_allclose(a * guide + b, 0.02 * guide - 1, atol=0.01)
+
+
+def test_doubt_is_one_where_the_noise_is_as_claimed_and_grows_with_its_square() -> None:
+    rng = np.random.default_rng(4)
+    cov = np.zeros((96, 128, 3), np.float32) + np.array([0.3, 0.1, 0.2], np.float32)
+    root = np.linalg.cholesky(np.array([[0.3, 0.1], [0.1, 0.2]]))
+    residual = rng.normal(size=(96, 128, 2)) @ root.T
+    everywhere = np.ones((96, 128), np.float32)
+    assert doubt_of_fit(residual, cov, everywhere) < 1.2
+    assert doubt_of_fit(3 * residual, cov, everywhere) == pytest.approx(9, rel=0.2)
+    few = residual.copy()
+    few[:20] += 30  # a fifth of the image moves: no reason to doubt the rest
+    assert doubt_of_fit(few, cov, everywhere) < 2.0
+    assert doubt_of_fit(3 * residual, cov, 0 * everywhere) == 1.0
+
+
+def test_evidence_of_a_wrong_pose_is_weak() -> None:
+    """The whole image disagrees with the pose: with doubt nothing is called moving, without it much is."""
+    rng = np.random.default_rng(1)
+    cov = np.full((96, 128, 3), 0.0, np.float32) + np.array([0.1, 0.0, 0.1], np.float32)
+    residual = (rng.normal(size=(96, 128, 2)) * 3).astype(np.float32)
+    plain = motion_log_ratio(residual, cov, CONFIG)
+    factor = doubt_of_fit(residual, cov, np.ones((96, 128), np.float32))
+    doubted = motion_log_ratio(residual, cov * np.float32(factor), CONFIG)
+    assert (plain > 1).mean() > 0.8 and (doubted > 1).mean() < 0.2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, NetworksConfig
+from .dynamics.head import plain_descriptors
 from .errors import ConfigError, InputError
 from .graph.places import PlaceIndex
 from .lookahead import ahead
@@ -21,6 +23,8 @@ from .types import Frame, Source, WorkFrame
 
 Array = NDArray[Any]
 Near = Callable[[Frame], WorkFrame | None]  # what a frame is probably seen beside
+DESCRIBED_PX = 4  # working pixels a plain descriptor
+REMEMBERED_FEATURES = 4  # frames whose features are kept: the mask of one is made when the next is already looked at
 
 
 @dataclass
@@ -35,6 +39,7 @@ class Parts:
     semantic: Callable[[Frame], Frame] | None = None  # fills Frame.semantic; None: what the source brings
     own_scale_known: bool = True  # False: the depth of every frame alone has a scale of its own
     pairs_ahead: bool = False  # the provider decodes a frame's pair before its turn, beside the keyframe of that time
+    descriptors: Callable[[Frame], Array] | None = None  # (h', w', c) of a network; None: plain descriptors
 
     def __post_init__(self) -> None:
         width, height = self.size
@@ -48,6 +53,12 @@ class Parts:
         if seen is None or seen.frame is not frame:
             return self.provider.beside(self._look(frame), near)
         return seen.work if seen.near is near and near is not None else self.provider.beside(seen.work, near)
+
+    def describe(self, frame: Frame) -> Array:
+        """(h', w', c) float32 descriptors of a frame, for the head that learns what moving things look like."""
+        if self.descriptors is not None:
+            return self.descriptors(frame)
+        return plain_descriptors(frame.image, self.size[0] // DESCRIBED_PX, self.size[1] // DESCRIBED_PX)
 
     def frames_ahead(self, frames: Iterator[Frame], near: Callable[[], Near]) -> Iterator[Frame]:
         """The frames, each read, and looked at for ``observe``, while the caller works on the one before.
@@ -93,7 +104,7 @@ def build_parts(config: Config, source: Source) -> Parts:
         provider_class = SensorDepthPointmaps if kind == "depth" else GeometricPointmaps
         parts = Parts(provider_class(width, height, config.tracking.cell_px), (width, height))
     if prior == "dinov2":
-        parts.semantic, note = _dinov2(config.networks)
+        parts.semantic, parts.descriptors, note = _dinov2(config.networks)
         parts.notes.append(note)
     parts.notes[:0] = notes
     return parts
@@ -170,17 +181,27 @@ def _mast3r(config: Config, source: Source) -> Parts:
     return parts
 
 
-def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:
-    """What gives a frame its P(foreground), with a memory over the video, and a line about it."""
+def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], Callable[[Frame], Array], str]:
+    """What gives a frame its P(foreground), with a memory over the video; its features; and a line about it."""
     path = weights.path(config.dinov2)
     from .networks.dinov2 import Dinov2Features
     from .networks.foreground import ForegroundPrior
 
     device = _device()
     precision = _precision(config, device)
-    features, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    network, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    known: dict[int, Array] = {}  # the network is asked once a frame, from whichever thread comes first
+    one_at_a_time = threading.Lock()
+
+    def features(frame: Frame) -> Array:
+        with one_at_a_time:
+            if frame.index not in known:
+                while len(known) >= REMEMBERED_FEATURES:
+                    known.pop(next(iter(known)))
+                known[frame.index] = network.one(frame.image).features
+            return known[frame.index]
 
     def fill(frame: Frame) -> Frame:
-        return replace(frame, semantic=prior(features.one(frame.image).features))
+        return replace(frame, semantic=prior(features(frame)))
 
-    return fill, f"DINOv2: {config.dinov2}, {precision} on {device}"
+    return fill, features, f"DINOv2: {config.dinov2}, {precision} on {device}"

@@ -17,7 +17,9 @@ from .config import Config, config_to_yaml
 from .errors import ConfigError, InputError, SlamError
 from .evaluation.evaluate import evaluate
 from .evaluation.image_error import psnr
+from .export.evidence import EvidenceSample
 from .export.machine import peak_rss_mib
+from .export.mask_video import MaskVideo
 from .export.read_run import read_run
 from .export.report import write_report
 from .export.report_data import gather_report_data
@@ -31,7 +33,7 @@ from .mapping.rasterise import accelerator
 from .parts import build_parts
 from .progress import Reporter, Silent
 from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
-from .second_pass import SecondPass, second_pass
+from .second_pass import Look, SecondPass, SeenMask, second_pass
 from .slam import Slam
 from .sources import open_source
 from .types import Source, StaticCloud
@@ -130,6 +132,7 @@ class _Job:
         self.timings: dict[str, float] = {}
         self._started = time.perf_counter()
         self._final: list[FinalFrame] = []
+        self._evidence: EvidenceSample | None = None  # of the frame that shows most
         folder.write_config(config_to_yaml(config))
         folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
         folder.note(*slam.parts.notes, *([rectifier.note] if rectifier is not None else []))
@@ -219,22 +222,28 @@ class _Job:
         return lens.focal_px if isinstance(lens, OpenCvLens) else lens.fx_px
 
     def _look_again(self, lens_view: LensView) -> SecondPass:
+        slam, folder = self.slam, self.folder
+        look = Look(self._final, slam.graph, slam.parts, self.config, lens_view, self.rectifier, slam.belief.head)
+        video = MaskVideo(folder.path / "masks.mp4", *slam.parts.size)
+        best = 0.0
         with self.reporter.stage("masks", len(self._final), "frames") as bar:
 
-            def on_mask(timestamp_s: float, moving: Array) -> None:
-                self.folder.write_mask(timestamp_s, moving)
+            def on_mask(seen: SeenMask) -> None:
+                nonlocal best
+                folder.write_mask(seen.timestamp_s, seen.over_photograph)
+                video.add(seen.timestamp_s, seen.image, seen.mask.probability)
+                shown = float(np.minimum(seen.mask.moving.mean(), 0.3)) + 1e-3 * len(seen.mask.evidence)
+                if shown > best:
+                    best = shown
+                    self._evidence = EvidenceSample(
+                        seen.timestamp_s, seen.image, seen.mask.probability, dict(seen.mask.evidence)
+                    )
                 bar.advance()
 
-            return second_pass(
-                self.source.frames(),
-                self._final,
-                self.slam.graph,
-                self.slam.parts,
-                self.config,
-                lens_view,
-                on_mask,
-                self.rectifier,
-            )
+            try:
+                return second_pass(self.source.frames(), look, on_mask)
+            finally:
+                video.close()
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
         mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed)
@@ -289,6 +298,7 @@ class _Job:
             ate.truth_in_map(len(recorded.trajectory.timestamps_s)) if ate and ate.rmse is not None else None,
             ate.scale if ate and ate.rmse is not None else None,
             title=self.source.name,
+            evidence=self._evidence,
         )
         write_report(self.folder.path, data)
 

@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import HOLDOUT_EVERY, Config
-from .dynamics.belief import DynamicBelief
-from .dynamics.data import DynamicsInput
+from .dynamics.data import DynamicMask, DynamicsInput
+from .dynamics.head import OnlineHead
+from .dynamics.two_way import TwoWayBelief
 from .finish import FinalFrame, kept_matches
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
+from .graph.point_votes import PointVotes
 from .lens_view import LensView
 from .parts import Parts
 from .rectify import Rectifier
@@ -32,7 +34,7 @@ class SecondPass:
 
     views: list[View] = field(default_factory=list)  # for the map; no holdout frame among them
     colors: dict[int, Array] = field(default_factory=dict)  # kf id -> (p, 3) uint8 at its px; no holdout frame
-    moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px
+    moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px, by all frames
     holdout: list[FinalFrame] = field(default_factory=list)
 
 
@@ -41,32 +43,87 @@ def is_holdout(position: int) -> bool:
     return position % HOLDOUT_EVERY == 0
 
 
-def second_pass(
-    frames: Iterator[Frame],
-    final: list[FinalFrame],
-    graph: KeyframeGraph,
-    parts: Parts,
-    config: Config,
-    lens_view: LensView,
-    on_mask: Callable[[float, Array], None],
-    rectifier: Rectifier | None = None,
-) -> SecondPass:
+@dataclass(frozen=True)
+class _Waiting:
+    """A frame whose mask is not there yet, without its photograph."""
+
+    position: int
+    place: FinalFrame
+    small: Array  # (h, w, 3) uint8 at working size, as tracking saw it
+    photograph: tuple[Array, Array] | None  # pinhole image and where it has data; only of training views
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the second pass needs beside the frames."""
+
+    final: list[FinalFrame]
+    graph: KeyframeGraph
+    parts: Parts
+    config: Config
+    lens_view: LensView
+    rectifier: Rectifier | None = None
+    head: OnlineHead | None = None  # what tracking learned of the looks of moving things
+
+
+@dataclass(frozen=True)
+class SeenMask:
+    """One frame's mask, as it comes."""
+
+    timestamp_s: float
+    image: Array  # (h, w, 3) uint8 RGB at working size, as tracking saw it
+    mask: DynamicMask  # over the image
+    over_photograph: Array  # (h, w) float32 P(moving) over the photograph at working scale
+
+
+def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask], None]) -> SecondPass:
     """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``.
 
     ``frames`` are photographs, and ``lens_view`` is of their lens. Where that was calibrated, ``rectifier`` makes
-    them what tracking saw. ``on_mask`` is given P(moving), (h, w) float32 over the photograph at working scale.
+    them what tracking saw. A mask waits for frames after it, so a few frames are held, never the video.
     """
-    out = SecondPass()
-    belief = DynamicBelief(config.dynamics, *parts.size)
-    chosen = _view_positions(final, config)
-    by_index = {f.record.index: f for f in final}
-    waiting: list[int] = []  # keyframes without colours yet
+    out, waiting, votes = SecondPass(), deque[_Waiting](), PointVotes()
+    graph, parts, lens_view = look.graph, look.parts, look.lens_view
+    chosen = _view_positions(look.final, look.config)
+    belief = TwoWayBelief(look.config.dynamics, *parts.size, look.head or OnlineHead(look.config.dynamics))
+    uncoloured: list[int] = []  # keyframes without colours yet
+    for mask in belief.masks(_inputs(frames, look, chosen, waiting)):
+        one = waiting.popleft()
+        place = one.place
+        moving = _over_photograph(mask.probability, look.rectifier)
+        on_mask(SeenMask(place.record.timestamp_s, one.small, mask, moving))
+        if place.record.is_keyframe:
+            uncoloured.append(place.record.kf_id)
+        if is_holdout(one.position):
+            out.holdout.append(place)
+            continue
+        for kf_id in uncoloured:  # a holdout keyframe takes its colours from the frame after it
+            out.colors[kf_id], p, _ = _seen_by(one.small, mask.probability, graph, kf_id, place)
+            votes.start(kf_id, p, out.colors[kf_id])
+        uncoloured.clear()
+        kf_id = place.record.kf_id
+        if kf_id in out.colors and not place.record.is_keyframe:
+            colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
+            votes.add(kf_id, p, colors, inside)
+        if one.photograph is not None:
+            uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
+            if uncertainty is not None:
+                uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
+            out.views.append(_view(one.photograph, place, moving, uncertainty, lens_view))
+    out.moving = votes.moving()
+    return out
+
+
+def _inputs(frames: Iterator[Frame], look: Look, chosen: set[int], waiting: deque[_Waiting]) -> Iterator[DynamicsInput]:
+    """What the mask is told of each frame; what is needed once the mask is there goes to ``waiting``."""
+    by_index = {f.record.index: f for f in look.final}
+    graph, parts = look.graph, look.parts
     photographs: deque[Frame] = deque()
 
     def tracked() -> Iterator[Frame]:
         for photograph in frames:
             photographs.append(photograph)
-            yield photograph if rectifier is None else rectifier.frame(photograph)
+            yield photograph if look.rectifier is None else look.rectifier.frame(photograph)
 
     def near(seen: Frame) -> WorkFrame | None:
         place = by_index.get(seen.index)
@@ -75,27 +132,15 @@ def second_pass(
     for position, seen in enumerate(parts.frames_ahead(tracked(), lambda: near)):
         frame, place = photographs.popleft(), by_index.get(seen.index)
         if place is None:
-            break
+            return
         work = parts.observe(seen, near(seen))
-        belief.prior(work.gray, work.semantic)
-        given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0)
-        mask = belief.update(given if parts.own_scale_known else _at_expected_scale(given))
-        moving = _over_photograph(mask.probability, rectifier)
-        on_mask(frame.timestamp_s, moving)
-        if place.record.is_keyframe:
-            waiting.append(place.record.kf_id)
-        if is_holdout(position):
-            out.holdout.append(place)
-            continue
-        for kf_id in waiting:  # a holdout keyframe takes its colours from the frame after it
-            out.colors[kf_id], out.moving[kf_id] = _seen_by(seen.image, mask.probability, graph, kf_id, place)
-        waiting.clear()
-        if position in chosen:
-            uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
-            if uncertainty is not None:
-                uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, rectifier))
-            out.views.append(_view(frame, place, moving, uncertainty, lens_view))
-    return out
+        small = cv2.resize(seen.image, parts.size, interpolation=cv2.INTER_AREA)
+        photograph = look.lens_view.pinhole_image(frame.image) if position in chosen else None
+        waiting.append(_Waiting(position, place, small, photograph))
+        features = parts.describe(seen) if look.config.dynamics.use_head else None
+        given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0, features)
+        given = replace(given, color=small)
+        yield given if parts.own_scale_known else _at_expected_scale(given)
 
 
 def _at_expected_scale(given: DynamicsInput) -> DynamicsInput:
@@ -117,8 +162,13 @@ def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
     return {usable[int(i)] for i in np.linspace(0, len(usable) - 1, most).round()} if most else set()
 
 
-def _seen_by(image: Array, moving: Array, graph: KeyframeGraph, kf_id: int, place: FinalFrame) -> tuple[Array, Array]:
-    """Colours (p, 3) uint8 and P(moving) (p,) of a keyframe's points in a frame's image; outside counts as moving."""
+def _seen_by(
+    small: Array, moving: Array, graph: KeyframeGraph, kf_id: int, place: FinalFrame
+) -> tuple[Array, Array, Array]:
+    """Colours (p, 3) uint8 and P(moving) (p,) of a keyframe's points in a frame's image, and (p,) bool: inside it.
+
+    Outside counts as moving.
+    """
     block, camera = graph.blocks[kf_id], graph.camera()
     if place.record.is_keyframe and place.record.kf_id == kf_id:
         px = block.px
@@ -129,8 +179,7 @@ def _seen_by(image: Array, moving: Array, graph: KeyframeGraph, kf_id: int, plac
         px = np.where(in_front[:, None], camera.project(np.where(in_front[:, None], points, 1.0)), -1e3)
     inside = (px > -0.5).all(1) & (px[:, 0] < camera.width - 0.5) & (px[:, 1] < camera.height - 0.5)
     at = np.clip(np.round(px), 0, [camera.width - 1, camera.height - 1]).astype(int)
-    small = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0)
+    return small[at[:, 1], at[:, 0]], np.where(inside, 1 - static_at(moving, px), 1.0), inside
 
 
 def _over_photograph(values: Array, rectifier: Rectifier | None) -> Array:
@@ -138,12 +187,18 @@ def _over_photograph(values: Array, rectifier: Rectifier | None) -> Array:
     return values if rectifier is None else rectifier.as_photograph(values)
 
 
-def _view(frame: Frame, place: FinalFrame, moving: Array, uncertainty: Array | None, lens_view: LensView) -> View:
-    image, inside = lens_view.pinhole_image(frame.image)
+def _view(
+    photograph: tuple[Array, Array],
+    place: FinalFrame,
+    moving: Array,
+    uncertainty: Array | None,
+    lens_view: LensView,
+) -> View:
+    image, inside = photograph
     p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
     static = np.clip(1 - lens_view.pinhole_map(p), 0.01, 1) * inside  # exactly 0 means: no data
     return View(
-        frame.timestamp_s,
+        place.record.timestamp_s,
         image,
         static.astype(np.float32),
         place.world_from_cam,

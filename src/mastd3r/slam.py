@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +92,10 @@ class Slam:
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
-        prior = self._mask.later(lambda: grown(self.belief.prior(work.gray, work.semantic)))  # III-A, prior of (2)
+        looks = self._mask.later(lambda: self.parts.describe(frame) if self.config.dynamics.use_head else None)
+        prior = self._mask.later(
+            lambda: grown(self.belief.prior(work.gray, work.semantic, looks.get()))
+        )  # prior of (2)
         if self._ref is None:
             return self._start(work, prior, "first view")
         view = self._find(work, prior)  # may change what is followed
@@ -101,7 +104,7 @@ class Slam:
             kf, view = self._retry(work, prior)
         if view is None:
             return self._start_again(work, prior)
-        moving = self._update_belief(work, kf, view, prior)  # III-A, (2)(3)
+        moving = self._update_belief(work, kf, view, prior, looks)  # III-A, (2)(3)
         self.graph.record(work, kf.id, view.alignment.new_from_ref, "tracked", view.pair.matches, view.weight)
         self._follow(kf, view, self._most_matched if kf is self._ref else 0)
         self._last = (work, moving)
@@ -323,12 +326,14 @@ class Slam:
             self._chain[i, j] = pair.flow
         return self.graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
 
-    def _update_belief(self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Later[Array]) -> Later[Array]:
+    def _update_belief(
+        self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Later[Array], looks: Later[Array | None]
+    ) -> Later[Array]:
         if not self.graph.initialised:
             return prior
         cam_from_world = view.alignment.new_from_ref @ self.graph.blocks[kf.id].cam_from_world
         given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
-        return self._mask.later(lambda: grown(self.belief.update(given).probability))
+        return self._mask.later(lambda: grown(self.belief.update(replace(given, features=looks.get())).probability))
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
         """Nothing can be seen: the frame has no place, and the next one is looked for where the last one was."""

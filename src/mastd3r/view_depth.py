@@ -126,9 +126,14 @@ def cell_centres(grid: tuple[int, int], width: int, height: int) -> Array:
 
 
 def dynamics_input(
-    graph: KeyframeGraph, kf_id: int, world_from_cam: Array, work: WorkFrame, scale: float
+    graph: KeyframeGraph,
+    kf_id: int,
+    world_from_cam: Array,
+    work: WorkFrame,
+    scale: float,
+    features: Array | None = None,
 ) -> DynamicsInput:
-    """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics."""
+    """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics, looks."""
     block, camera = graph.blocks[kf_id], graph.camera()
     new_from_ref = inverse(world_from_cam) @ inverse(block.cam_from_world)
     value, trusted = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
@@ -144,4 +149,5 @@ def dynamics_input(
         upsampled(sigma, work.grid, *graph.size),
         own,
         work.semantic,
+        features,
     )

@@ -20,6 +20,7 @@ from .motion import (
     Information,
     RigidFlow,
     along_epipolar,
+    doubt_of_fit,
     flow_covariance,
     motion_log_ratio,
     pose_jacobian,
@@ -94,6 +95,8 @@ class MotionTest:
         trust = np.exp(-0.5 * (error / self.config.round_trip_px) ** 2) * inside
         residual = left - self._pose_error(rigid, left, trust * static)
         wide = along_epipolar(cov, rigid.slope, depth[1])
+        if self.config.use_doubt:
+            wide = wide * np.float32(doubt_of_fit(residual, wide, inside))
         ratio = motion_log_ratio(residual, wide, self.config) * trust
         covered = self._flow.warp(past.moving, rigid.target)
         ratio += inside * self._grey_values(small, stable, left, inside, noise, (1 - trust) * (1 - covered))
@@ -109,6 +112,9 @@ class MotionTest:
         cur, still = small.astype(np.float32), stable.astype(np.float32)
         still *= float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3)
         as_static = mismatch(cur, still, noise)
+        if self.config.use_doubt:
+            noise = noise * max(1.0, float(np.median(as_static[inside > 0])) if inside.any() else 1.0)
+            as_static = mismatch(cur, still, noise)
         as_flow = mismatch(cur, self._flow.warp(still, self._flow.grid + left), noise)
         clash = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * open_to_doubt
         fits = np.clip(self.config.photo_gain * (as_static - as_flow), -3, 0)

@@ -18,6 +18,9 @@ class DynamicsConfig:
     use_motion: bool = True  # (b) flow and grey values against the rigid scene of pose and depth
     use_semantic: bool = True  # (c) P(movable) of the frame
     use_time: bool = True  # (d) the last belief, carried along the flow
+    use_head: bool = True  # (e) looks of what moved in this video, learned online
+    use_future: bool = True  # second pass: frames after this one are evidence too
+    use_doubt: bool = True  # evidence weakens where the static majority fits worse than pose and depths claim
     use_regions: bool = True  # pooling of the belief inside image edges
     memory: float = 0.85  # share of the carried log-odds that is kept from one frame to the next
     evidence_gain: float = 1.0  # weight of one frame's log ratios
@@ -25,7 +28,11 @@ class DynamicsConfig:
     semantic_gain: float = 0.8  # weight of the map's log-odds
     semantic_share: float = 0.3  # weight of our evidence where there is a map: it repeats from frame to frame
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
-    gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with
+    gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with while tracking
+    second_gaps: tuple[int, ...] = (1, 4, 12)  # frames back and forth, in the second pass; the last is its delay
+    head_share: float = 0.5  # weight of the head's log-odds
+    head_limit: float = 4.0  # its log-odds are bounded by this
+    head_memory: float = 0.99  # share of what it knows that is kept from one frame to the next
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
     texture_noise: float = 4.0  # grey levels of noise that a texture has to beat
     motion_spread_px: float = 4.0  # 1 sigma of what a moving thing adds to the flow
@@ -42,6 +49,9 @@ class DynamicsConfig:
     region_px: float = 20.0  # reach of the pooling where there is no edge
     region_contrast: float = 15.0  # grey levels that are as far as region_px
     semantic_contrast: float = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
+    chroma_gain: float = 1.5  # a step of colour against one of grey, for outlines
+    fine_px: float = 8.0  # reach of the last step at full size, where there is colour
+    fine_contrast: float = 12.0  # grey levels that are as far as fine_px
     edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
     edge_contrast: float = 30.0  # grey levels that it takes for an edge
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth

@@ -25,6 +25,8 @@ class DynamicsInput:
     inv_depth_sigma: Array  # (h, w) float32, 1 sigma; inf = unknown
     own_inv_depth: Array | None = None  # (h, w) float32 measured in this frame, 0 = none
     semantic: Array | None = None  # (h, w) float32 P(movable)
+    color: Array | None = None  # (h, w, 3) uint8 RGB; outlines follow its edges where it is there
+    features: Array | None = None  # (h', w', c) float32 descriptors of any kind, for the head
 
 
 @dataclass(frozen=True)

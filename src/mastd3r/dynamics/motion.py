@@ -96,6 +96,23 @@ def flow_covariance(information: Information, base_px: float, widest_px: float) 
     return cv2.merge([yy / det + base_px**2, -xy / det, xx / det + base_px**2])
 
 
+def doubt_of_fit(residual: Array, cov: Array, weight: Array) -> float:
+    """Factor >= 1 by which ``cov`` (h, w, 3) is too small for the weighted majority of ``residual`` (h, w, 2).
+
+    The median of the squared Mahalanobis length over that of two unit normals, 2 ln 2. Where pose or depths are worse
+    than they claim, most pixels show it, and the evidence of all must weaken.
+    """
+    rows = (slice(2, None, 4), slice(2, None, 4))
+    r, c, w = residual[rows].astype(float), cov[rows].astype(float), weight[rows]
+    known = (w > 0.5) & np.isfinite(r).all(-1) & np.isfinite(c).all(-1)
+    if known.sum() < 50:
+        return 1.0
+    r, c = np.clip(r[known], -_UNKNOWN_PX, _UNKNOWN_PX), c[known]
+    det = np.maximum(c[:, 0] * c[:, 2] - c[:, 1] ** 2, 1e-12)
+    length = (c[:, 2] * r[:, 0] ** 2 - 2 * c[:, 1] * r[:, 0] * r[:, 1] + c[:, 0] * r[:, 1] ** 2) / det
+    return max(1.0, float(np.median(length)) / (2 * np.log(2)))
+
+
 def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Array:
     """log p(residual | moving) - log p(residual | static), (h, w) float32.
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Trajectory
+from .evidence import FULL_SCALE_LOG, EvidenceSample, panel
 from .files import write_text
 from .metric_names import described, in_order, shown, summary_line
 from .pictures import DIFFERENCE_FULL_SCALE, data_uri, difference, fitted, mask_overlay
@@ -58,6 +59,7 @@ class ReportData:
     metrics: Mapping[str, Any]
     record: Mapping[str, Any]  # run.json
     config: str  # YAML text
+    evidence: EvidenceSample | None = None
 
 
 def write_report(run_dir: Path, data: ReportData) -> Path:
@@ -73,6 +75,7 @@ def report_html(data: ReportData) -> str:
     sections = [
         _renders(data.renders),
         _masks(data.masks),
+        _evidence(data.evidence),
         _trajectory(data),
         _numbers(data.metrics, data.record.get("camera") or {}),
         _timings(data.record.get("timings_s") or {}),
@@ -141,6 +144,18 @@ def _masks(samples: Sequence[MaskSample]) -> str:
         figures.append(_figure(picture, caption, f"P(moving) over the frame at {s.timestamp_s:.3f} s"))
     text = f"P(moving) over the photograph: {_scale_bar('heat moving', '1')}, with P = 0.5 outlined in white."
     return _section("What moves", text, f'<div class="row cells">{"".join(figures)}</div>')
+
+
+def _evidence(sample: EvidenceSample | None) -> str:
+    if sample is None:
+        return ""
+    cells = [(name, fitted(picture, OVERLAY_WIDTH_PX)) for name, picture in panel(sample)]
+    figures = [_figure(picture, escape(name), f"{name} at {sample.timestamp_s:.3f} s") for name, picture in cells]
+    text = (
+        f"The frame at {sample.timestamp_s:.3f} s. Log-likelihood ratios: red speaks for moving, blue for standing "
+        f"still, full colour at {FULL_SCALE_LOG:g}; grey says nothing. The video of all frames is masks.mp4."
+    )
+    return _section("What speaks for it", text, f'<div class="row cells">{"".join(figures)}</div>')
 
 
 def _trajectory(data: ReportData) -> str:

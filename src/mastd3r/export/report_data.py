@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame
+from .evidence import EvidenceSample
 from .read_run import Run
 from .report import MaskSample, RenderSample, ReportData
 from .run_folder import stamp
@@ -25,6 +26,7 @@ def gather_report_data(
     truth_in_map: Array | None = None,
     metres_per_unit: float | None = None,
     title: str = "",
+    evidence: EvidenceSample | None = None,
 ) -> ReportData:
     """Choose the pictures and put the path into metres where truth gives the scale.
 
@@ -59,6 +61,7 @@ def gather_report_data(
         metrics=run.metrics,
         record=run.record,
         config=run.config,
+        evidence=evidence,
     )
 
 

@@ -25,7 +25,7 @@ from .trajectory_files import write_tum
 Array = NDArray[Any]
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "metrics.json", "report.html", "aligned.txt",
+    "metrics.json", "report.html", "aligned.txt", "masks.mp4",
 )  # fmt: skip
 FOLDERS = ("masks", "renders")
 RESERVE_BYTES = 2**20  # given back when the disk is full, so that the end of a run can still be written
