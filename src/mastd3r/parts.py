@@ -178,7 +178,8 @@ def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], str]:
 
     device = _device()
     precision = _precision(config, device)
-    features, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    recorded = device != "cpu" and config.execution in ("auto", "graph")
+    features, prior = Dinov2Features(path, device, precision, recorded), ForegroundPrior()
 
     def fill(frame: Frame) -> Frame:
         return replace(frame, semantic=prior(features.one(frame.image).features))
