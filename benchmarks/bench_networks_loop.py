@@ -20,6 +20,8 @@ from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.finish import final_frames, trajectory_of
 from mastd3r.graph.places import PlaceIndex
+from mastd3r.networks.dinov2 import Dinov2Features
+from mastd3r.networks.foreground import ForegroundPrior
 from mastd3r.networks.matching import RecordedMatching, match_pixels
 from mastd3r.networks.pair import PairNetwork
 from mastd3r.parts import Parts
@@ -98,14 +100,14 @@ def dinov2(b: Any) -> dict[str, Any]:
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         _random_dinov2(Path(folder), b.small)
-        from mastd3r.networks.dinov2 import Dinov2Features
-        from mastd3r.networks.foreground import ForegroundPrior
 
         pixels = torch.from_numpy(photograph).to(b.device).permute(2, 0, 1)[None].float() / 255
         for dtype in dict.fromkeys(["float32", b.auto]):
             features = Dinov2Features(folder, str(b.device), dtype)
             found[f"{dtype}, features on the device"] = b.timed(lambda f=features: f.tokens(pixels))
             found[f"{dtype}, from and to numpy"] = b.timed(lambda f=features: f.one(photograph))
+            if b.execution == "graph":
+                features = _recorded(b, features, folder, dtype, photograph, found)
         prior, cells = ForegroundPrior(), features.one(photograph).features
         found["prior of the features"] = b.timed(lambda: prior(cells))
         found["pointmap network alone"] = b.timed(call)
@@ -113,6 +115,22 @@ def dinov2(b: Any) -> dict[str, Any]:
         if b.device.type == "cuda":
             found["both, two queues"] = b.timed(_beside(call, lambda: features.tokens(pixels)))
     return found
+
+
+def _recorded(
+    b: Any, plain: Dinov2Features, folder: str, dtype: str, photograph: Any, found: dict[str, Any]
+) -> Dinov2Features:
+    """DINOv2 as a recording, where that can be made; the plain one, and a line about it, where not."""
+    try:
+        played = Dinov2Features(folder, str(b.device), dtype, recorded=True)
+        found[f"{dtype}, from and to numpy, recorded"] = b.timed(lambda: played.one(photograph))
+        gap = np.abs(played.one(photograph).features - plain.one(photograph).features).max()
+        found[f"{dtype}, largest difference of the recorded"] = float(gap)
+    except RuntimeError as e:
+        b.result["failed"]["DINOv2 recorded"] = " ".join(str(e).split())[:300]
+        return plain
+    b.dinov2_recorded = True
+    return played
 
 
 def _beside(one: Callable[[], Any], other: Callable[[], Any]) -> Callable[[], Any]:
@@ -171,12 +189,10 @@ def loop(b: Any) -> dict[str, Any]:
 
 def _dinov2_for_its_time(b: Any) -> Callable[[Frame], Frame]:
     """Features and prior as the package makes them, from random weights; the answer is that nothing is known."""
-    from mastd3r.networks.dinov2 import Dinov2Features
-    from mastd3r.networks.foreground import ForegroundPrior
-
     with tempfile.TemporaryDirectory() as folder:
         _random_dinov2(Path(folder), b.small)
-        features, prior = Dinov2Features(folder, str(b.device), b.auto), ForegroundPrior()
+        recorded = getattr(b, "dinov2_recorded", False)
+        features, prior = Dinov2Features(folder, str(b.device), b.auto, recorded), ForegroundPrior()
     unknown = DynamicsConfig().base_rate
 
     def fill(frame: Frame) -> Frame:

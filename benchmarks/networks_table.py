@@ -77,7 +77,7 @@ def _errors(parts: dict[str, Any]) -> list[str]:
 
 def _others(parts: dict[str, Any]) -> list[str]:
     rows = [["matching: " + k, *_row(k, v)[1:]] for k, v in parts.get("matching", {}).items()]
-    rows += [["DINOv2: " + k, *_row(k, v)[1:]] for k, v in parts.get("dinov2", {}).items()]
+    rows += [["DINOv2: " + k, *_row(k, v)[1:]] for k, v in parts.get("dinov2", {}).items() if isinstance(v, dict)]
     lines = _table(["beside it", "ms", "a second", "memory [MiB]"], rows)
     for name, v in parts.get("matching", {}).items():
         if agreed := v.get("against_host"):

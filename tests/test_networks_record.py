@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from torch.utils._pytree import tree_leaves
 
 from known_pair import decoded, look
 from mastd3r.networks import pair as pair_module
+from mastd3r.networks.dinov2 import Dinov2Features
 from mastd3r.networks.mast3r import Mast3rConfig, random_mast3r
 from mastd3r.networks.matching import RecordedMatching, match_pixels
 from mastd3r.networks.pair import NetworkPair, PairNetwork
@@ -93,6 +95,17 @@ def test_recorded_matching_is_the_same(recordings: list[OnHost]) -> None:
     assert len(recordings) == 2  # 540 pixels; 301 and 397 are one shape
     back = search(first, second, px, None, MatchOptions(reciprocal_px=1.0))
     assert len(recordings) == 3 and back[1].sum() < search(first, second, px, None, options)[1].sum()
+
+
+def test_dinov2_is_recorded_too(recordings: list[OnHost], tmp_path: Path) -> None:
+    transformers = pytest.importorskip("transformers", reason="DINOv2 needs pip install 'mastd3r-slam[networks]'")
+    sizes = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "image_size": 98, "patch_size": 14}
+    transformers.Dinov2Model(transformers.Dinov2Config(**sizes)).save_pretrained(tmp_path)
+    plain, played = (Dinov2Features(tmp_path, recorded=how) for how in (False, True))
+    for n in range(3):
+        image = photograph(96, 64, n)
+        np.testing.assert_array_equal(played.one(image).features, plain.one(image).features)
+    assert [r.played for r in recordings] == [3]
 
 
 def test_recordings_are_not_made_without_end(recordings: list[OnHost]) -> None:

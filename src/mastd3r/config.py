@@ -112,8 +112,8 @@ class NetworksConfig:
     mast3r: str = "mast3r"  # a file
     dinov2: str = "dinov2-with-registers-small"  # a folder
     precision: PrecisionKind = "auto"  # of the matrix products; auto: bfloat16 on an accelerator, float32 on the CPU
-    execution: ExecutionKind = "auto"  # of MASt3R; eager: layer by layer; graph: recorded once a size, CUDA only;
-    # compile: torch.compile, minutes at the first frame; auto: graph on an accelerator, eager on the CPU
+    execution: ExecutionKind = "auto"  # eager: layer by layer; graph: recorded once a size, CUDA only; compile:
+    # torch.compile of MASt3R, minutes at the first frame; auto: graph on an accelerator, eager on the CPU
     depth_sigma_ratio: float = 0.08  # relative 1-sigma of MASt3R's depth of a frame, its scale apart; a run says what
     # it found. Chosen: weights to measure it with were not at hand
     long_side_px: int = 512  # of the image that MASt3R sees, a multiple of 16; it was trained at 512

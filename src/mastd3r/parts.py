@@ -189,7 +189,8 @@ def _dinov2(config: NetworksConfig) -> tuple[Callable[[Frame], Frame], Callable[
 
     device = _device()
     precision = _precision(config, device)
-    network, prior = Dinov2Features(path, device, precision), ForegroundPrior()
+    recorded = device != "cpu" and config.execution in ("auto", "graph")
+    network, prior = Dinov2Features(path, device, precision, recorded), ForegroundPrior()
     known: dict[int, Array] = {}  # the network is asked once a frame, from whichever thread comes first
     one_at_a_time = threading.Lock()
 

@@ -19,6 +19,7 @@ from torch.nn.functional import interpolate
 
 from ..errors import InputError, MissingPackage
 from .products import products
+from .record import Recorder
 from .weights import path as weights_path
 
 Array = NDArray[Any]
@@ -51,9 +52,16 @@ def cell_centres_px(rows: int, cols: int, width: int, height: int) -> Array:
 class Dinov2Features:
     """A loaded DINOv2 of any size, with or without registers."""
 
-    def __init__(self, path_or_id: str | Path, device: str = "cpu", dtype: str | torch.dtype = "float32") -> None:
+    def __init__(
+        self,
+        path_or_id: str | Path,
+        device: str = "cpu",
+        dtype: str | torch.dtype = "float32",
+        recorded: bool = False,
+    ) -> None:
         """``path_or_id``: a folder with config.json and model.safetensors, or a name or hub id of ``weights``.
 
+        ``recorded``: play the layers back as one launch, on CUDA.
         Raises MissingPackage (no transformers), InputError (weights that are absent, damaged or not DINOv2).
         """
         folder = weights_path(str(path_or_id))
@@ -63,6 +71,9 @@ class Dinov2Features:
         config = self.model.config
         self.patch_px = int(config.patch_size)
         self.channels: int = config.hidden_size
+        self._hidden = self._layers
+        if recorded:
+            self._hidden = Recorder(self.device).recorded(self._layers)
         self.extra_tokens: int = 1 + getattr(config, "num_register_tokens", 0)
 
     def __call__(self, images: Sequence[Array]) -> list[FeatureMap]:
@@ -77,6 +88,10 @@ class Dinov2Features:
         """Features of one (h, w, 3) uint8 RGB image."""
         return self([image])[0]
 
+    def _layers(self, pixels: torch.Tensor) -> torch.Tensor:
+        hidden: torch.Tensor = self.model(pixel_values=pixels).last_hidden_state
+        return hidden
+
     @torch.inference_mode()
     def tokens(self, pixels: torch.Tensor) -> torch.Tensor:
         """(b, 3, h, w) float RGB in 0..1, on any device, to (b, rows, cols, c) float32 on the model's device.
@@ -86,7 +101,7 @@ class Dinov2Features:
         ready = self.preprocess(pixels.to(self.device))
         rows, cols = ready.shape[2] // self.patch_px, ready.shape[3] // self.patch_px
         with products(self.dtype):
-            hidden = self.model(pixel_values=ready.to(self.dtype)).last_hidden_state
+            hidden = self._hidden(ready.to(self.dtype))
         features = hidden[:, self.extra_tokens :].reshape(len(ready), rows, cols, -1).float()
         if not bool(torch.isfinite(features).all()):
             raise InputError(f"DINOv2 in {self.dtype}: expected finite features, got some that are not; use float32")
