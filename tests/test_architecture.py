@@ -70,7 +70,7 @@ HEAVY = {  # package: who may import it
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights"},
 }
-NAMES_A_DEVICE = {"mapping.rasterise"}
+NAMES_A_DEVICE = {"mapping.rasterise", "config"}  # config: the values that mapping.device may have
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
 EXITS = {"cli", "__main__"}

@@ -223,6 +223,7 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
 def _doctor(args: argparse.Namespace, console: Console) -> int:
     from .export.machine import machine_info
+    from .mapping.rasterise import map_device
     from .parts import chosen_pointmaps
 
     table = Table(show_header=False)
@@ -230,6 +231,7 @@ def _doctor(args: argparse.Namespace, console: Console) -> int:
         table.add_row(key, str(value))
     Console().print(table)
     kind, why = chosen_pointmaps(Config())
-    Console().print(f"pointmaps auto: {kind} ({why}) · splat backend: cpu (numba)")
+    device, reason = map_device("auto")
+    Console().print(f"pointmaps auto: {kind} ({why}) · map auto: {device} ({reason})")
     Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
     return 0

@@ -19,6 +19,7 @@ PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
 SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
 CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
+MapDeviceKind = Literal["auto", "cpu", "cuda"]
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
 
 
@@ -83,6 +84,7 @@ class MappingConfig:
     """The Gaussian map (III-C)."""
 
     enabled: bool = True
+    device: MapDeviceKind = "auto"  # auto: the accelerator where gsplat draws on it, the CPU otherwise
     loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
     width_px: int = 320  # width of the images that the map is trained on and rendered at
     iterations: int = 3000  # optimisation steps, one view each

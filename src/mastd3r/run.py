@@ -27,6 +27,7 @@ from .geometry.camera import Camera
 from .lens_view import LensView
 from .mapping.mapper import Mapper
 from .mapping.ply import write_gaussians_ply
+from .mapping.rasterise import map_device
 from .parts import build_parts
 from .progress import Reporter, Silent
 from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
@@ -69,8 +70,9 @@ def run(
     rectifier = rectifier_for(config.camera.intrinsics, source.size)
     tracked = _tracked(source, rectifier)
     parts = build_parts(config, tracked)  # refuses before anything is written
+    device = _map_device(config, parts.notes)
     slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
-    job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent())
+    job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent(), device)
     try:
         job.everything()
     except SlamError as e:
@@ -95,6 +97,16 @@ def _config_of_slam(config: Config, rectifier: Rectifier | None) -> Config:
     return replace(config, camera=replace(config.camera, intrinsics=(c.fx_px, c.fy_px, c.cx_px, c.cy_px)))
 
 
+def _map_device(config: Config, notes: list[str]) -> str:
+    """Where the map will live; the choice and its reason go to ``notes``. Raises InputError, see ``map_device``."""
+    if not config.mapping.enabled:
+        return "cpu"
+    device, why = map_device(config.mapping.device)
+    notes.append(f"map on {device}" + (f", chosen by auto ({why})" if why else ""))
+    log.info(notes[-1])
+    return device
+
+
 class _Job:
     """One run in progress."""
 
@@ -106,7 +118,9 @@ class _Job:
         slam: Slam,
         folder: RunFolder,
         reporter: Reporter,
+        map_device: str = "cpu",
     ) -> None:
+        self._map_device = map_device
         self.source, self.rectifier = source, rectifier  # frames of the source are photographs
         self.tracked = _tracked(source, rectifier)
         self.config, self.slam, self.folder, self.reporter = config, slam, folder, reporter
@@ -218,7 +232,7 @@ class _Job:
             )
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
-        mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed)
+        mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed, self._map_device)
         with self.reporter.stage("map", self.config.mapping.iterations, "steps") as bar:
             mapper.refine(self.config.mapping.iterations, lambda _step, _loss: bar.advance())
         write_gaussians_ply(self.folder.path / "gaussians.ply", mapper.gaussians)

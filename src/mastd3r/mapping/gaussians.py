@@ -46,6 +46,23 @@ class GaussianMap:
         """The tensors that are optimised, by name."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
+    @staticmethod
+    def from_arrays(arrays: GaussianArrays, device: str = "cpu") -> GaussianMap:
+        """The map that ``arrays()`` gave, as new leaves on ``device``."""
+        logits = np.log(np.clip(arrays.opacities, 1e-6, 1 - 1e-6) / np.clip(1 - arrays.opacities, 1e-6, 1))
+        plain = {
+            "means": arrays.means,
+            "log_scales": np.log(arrays.scales),
+            "quats": arrays.quats,
+            "opacity_logits": logits,
+            "colors": arrays.colors,
+        }
+        leaves = {
+            name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
+            for name, array in plain.items()
+        }
+        return GaussianMap(**leaves, kf_id=torch.tensor(arrays.kf_id, dtype=torch.int32, device=device))
+
     def picked(self, rows: torch.Tensor) -> GaussianMap:
         """A copy of some rows, in the order given (repeats allowed), as new leaves."""
         tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}

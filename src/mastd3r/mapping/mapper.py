@@ -60,9 +60,10 @@ class Mapper:
         self._adam = RowAdam(self._map.parameters())
         self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
-        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, device)
+        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth)
         self._background = _mean_color(self._views).to(device)
         self._order = _view_order(len(self._views), seed)
+        self._targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
         self._step = 0
 
     @property
@@ -90,7 +91,7 @@ class Mapper:
         With ``timestamp_s`` the exposure (and the pose correction, where poses are refined) is interpolated
         between the training views around it, else the exposure is neutral and the pose as given.
         """
-        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float))).to(self._device)
+        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))
         K = torch.from_numpy(camera.matrix).to(self._device)
         with torch.no_grad():
             if timestamp_s is not None:
@@ -117,12 +118,12 @@ class Mapper:
         return self._map.draw(cam_from_world, K, width, height, self._near, self._background, stats)
 
     def _one_step(self, number: int) -> float:
-        view, camera, stats = self._views[number], self._views[number].camera, ScreenStats()
+        camera, stats = self._views[number].camera, ScreenStats()
         K = torch.from_numpy(camera.matrix).to(self._device)
         cam_from_world = self._view_parameters.cam_from_world(number)
         color, _, _ = self._draw(cam_from_world, K, camera.width, camera.height, stats)
         color = self._view_parameters.exposed(color, number)
-        loss = self._loss(color, view) + self._view_parameters.prior(number)
+        loss = self._loss(color, number) + self._view_parameters.prior(number).to(color.device)
         loss.backward()
         self._policy.observe(self._map, stats, camera.width)
         self._adam.step(self._map.parameters(), self._current_rates())
@@ -131,15 +132,26 @@ class Mapper:
             self._map = self._policy.round(self._map, self._adam, camera.width)
         return float(loss.detach())
 
-    def _loss(self, color: torch.Tensor, view: View) -> torch.Tensor:
-        c = self.config
-        target, static = (torch.from_numpy(np.ascontiguousarray(a)).to(color) for a in (view.image, view.static))
-        u = None if view.uncertainty is None else torch.from_numpy(view.uncertainty).to(color)
-        paper = c.paper_loss
-        weight = pixel_weight(c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, paper)
-        if paper:
+    def _loss(self, color: torch.Tensor, number: int) -> torch.Tensor:
+        target, weight = self._target(number)
+        if self.config.paper_loss:
             return mask_loss(squared_color_error(color, target), weight)
         return photometric_loss(color, target, weight)
+
+    def _target(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Photograph and pixel weight of eq. (17) of one view, on the map's device; made once."""
+        if number not in self._targets:
+            c, view = self.config, self._views[number]
+            target, static = self._tensor(view.image), self._tensor(view.static)
+            u = None if view.uncertainty is None else self._tensor(view.uncertainty)
+            weight = pixel_weight(
+                c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, c.paper_loss
+            )
+            self._targets[number] = target, weight
+        return self._targets[number]
+
+    def _tensor(self, array: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device, torch.float32)
 
     @property
     def _done_ratio(self) -> float:
