@@ -98,7 +98,9 @@ def gradient_errors(device: str) -> dict[str, Any]:
             scene, K = random_scene(kind, seed)
             image, grads = with_grads(on_device, scene, K)
             exact_image, exact = with_grads(rasterise_reference, scene, K)
-            values = max(values, *(float((a - b).abs().max()) for a, b in zip(image, exact_image, strict=True)))
+            values = max(
+                values, *(float((a - b).detach().abs().max()) for a, b in zip(image, exact_image, strict=True))
+            )
             for name, a, b in zip(NAMES, grads, exact, strict=True):
                 worst[name] = max(worst[name], float((a - b).norm() / b.norm()))
         out[kind] = {"value_error_max": values, **worst}
@@ -233,7 +235,7 @@ def main() -> int:
     parser.add_argument("run", type=Path, help="finished run folder")
     parser.add_argument("--out", type=Path, default=Path("gpu_map.json"))
     parser.add_argument("--steps", type=int, default=300, help="training steps that are timed on the accelerator")
-    parser.add_argument("--cpu-steps", type=int, default=60, help="the same on the CPU")
+    parser.add_argument("--cpu-steps", type=int, default=300, help="the same on the CPU")
     parser.add_argument("--repeats", type=int, default=15)
     args = parser.parse_args()
     report, device = Report(args.out, args.run), torch_device()
