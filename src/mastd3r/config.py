@@ -95,6 +95,9 @@ class MappingConfig:
     tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
     lambda_uncertainty: float = 0.1  # eq. (17)
     paper_loss: bool = False  # True: squared error with the weights as printed; False: L1 + 0.2 D-SSIM
+    ssim_share: float = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
+    exposure: bool = True  # a gain and a bias a colour channel for every training view
+    sh_degree: int = 0  # 0 to 3: spherical harmonics, colour that depends on the direction of view
     refine_poses: bool = True  # move the training cameras through the render gradient
 
 

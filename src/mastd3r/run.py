@@ -25,7 +25,7 @@ from .export.run_folder import RunFolder
 from .finish import FinalFrame, final_frames, finish_graph, static_cloud, trajectory_of
 from .geometry.camera import Camera
 from .lens_view import LensView
-from .mapping.mapper import Mapper
+from .mapping.mapper import Mapper, check_map_options
 from .mapping.ply import write_gaussians_ply
 from .mapping.rasterise import map_device
 from .parts import build_parts
@@ -49,6 +49,15 @@ class RunResult:
     metrics: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class MapMaterial:
+    """What a map is made from."""
+
+    cloud: StaticCloud
+    seen: SecondPass
+    lens_view: LensView
+
+
 def run(
     source_path: str | Path,
     out: Path,
@@ -59,6 +68,26 @@ def run(
     maps: Path | None = None,
 ) -> RunResult:
     """Do everything for one source. Raises SlamError children; what was computed until then is in the folder."""
+    job = _job(source_path, out, config, command or [], reporter or Silent(), maps)
+    try:
+        job.everything()
+    except SlamError as e:
+        job.save_the_rest(str(e))
+        raise
+    except KeyboardInterrupt:
+        job.save_the_rest("stopped by the user (Ctrl-C)")
+        raise
+    return RunResult(job.folder.path, job.metrics)
+
+
+def material_for_map(source_path: str | Path, out: Path, config: Config) -> MapMaterial:
+    """Everything of ``run`` that comes before the map, for those who train several on the same. Raises as ``run``."""
+    return _job(source_path, out, config, [], Silent(), None).before_map()[1]
+
+
+def _job(
+    source_path: str | Path, out: Path, config: Config, command: list[str], reporter: Reporter, maps: Path | None
+) -> _Job:
     want_semantic = config.semantics in ("auto", "maps")
     source = open_source(
         source_path,
@@ -72,16 +101,7 @@ def run(
     parts = build_parts(config, tracked)  # refuses before anything is written
     device = _map_device(config, parts.notes)
     slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
-    job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent(), device)
-    try:
-        job.everything()
-    except SlamError as e:
-        job.save_the_rest(str(e))
-        raise
-    except KeyboardInterrupt:
-        job.save_the_rest("stopped by the user (Ctrl-C)")
-        raise
-    return RunResult(job.folder.path, job.metrics)
+    return _Job(source, rectifier, config, slam, RunFolder(out, command), reporter, device)
 
 
 def _tracked(source: Source, rectifier: Rectifier | None) -> Source:
@@ -98,7 +118,11 @@ def _config_of_slam(config: Config, rectifier: Rectifier | None) -> Config:
 
 
 def _map_device(config: Config, notes: list[str]) -> str:
-    """Where the map will live; the choice and its reason go to ``notes``. Raises InputError, see ``map_device``."""
+    """Where the map will live; the choice and its reason go to ``notes``.
+
+    Raises InputError, see ``map_device``, and ConfigError for options of the map outside their range.
+    """
+    check_map_options(config.mapping)
     if not config.mapping.enabled:
         return "cpu"
     device, why = map_device(config.mapping.device)
@@ -134,6 +158,19 @@ class _Job:
 
     def everything(self) -> None:
         """All stages in order."""
+        frames, material = self.before_map()
+        cloud, seen = material.cloud, material.seen
+        if self.config.mapping.enabled and not (seen.views and len(cloud.points_world)):
+            self.folder.note(f"no map: {len(seen.views)} frames can show it, {len(cloud.points_world)} points start it")
+        elif self.config.mapping.enabled:
+            with self._timed("map"):
+                mapper = self._map(cloud, seen)
+            with self._timed("renders"):
+                self._render(mapper, seen, material.lens_view)
+        self._finish(frames)
+
+    def before_map(self) -> tuple[int, MapMaterial]:
+        """Tracking, joint optimisation, masks and cloud: the number of frames, and what a map is made from."""
         with self._timed("tracking"):
             frames = self._track()
         with self._timed("joint optimisation"):
@@ -143,14 +180,7 @@ class _Job:
             seen = self._look_again(lens_view)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
         self.folder.write_cloud(cloud)
-        if self.config.mapping.enabled and not (seen.views and len(cloud.points_world)):
-            self.folder.note(f"no map: {len(seen.views)} frames can show it, {len(cloud.points_world)} points start it")
-        elif self.config.mapping.enabled:
-            with self._timed("map"):
-                mapper = self._map(cloud, seen)
-            with self._timed("renders"):
-                self._render(mapper, seen, lens_view)
-        self._finish(frames)
+        return frames, MapMaterial(cloud, seen, lens_view)
 
     def _track(self) -> int:
         count = 0

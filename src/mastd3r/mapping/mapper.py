@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from ..config import MappingConfig
-from ..errors import InputError
+from ..errors import ConfigError, InputError
 from ..geometry.camera import Camera
 from ..types import StaticCloud, View
 from .adam import RowAdam
@@ -32,6 +32,7 @@ class TrainingRates:
     quats: float = 1e-3
     opacity_logits: float = 5e-2
     colors: float = 2.5e-3
+    sh_rest: float = 1.25e-4
 
 
 SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
@@ -52,15 +53,18 @@ class Mapper:
     ) -> None:
         """Seed the map from ``cloud``; ``views`` beyond ``config.max_views`` are thinned evenly.
 
-        Raises InputError for no view, views of the wrong shape, or a cloud without a usable point.
+        Raises InputError for no view, views of the wrong shape, or a cloud without a usable point, ConfigError for
+        options outside their range.
         """
+        check_map_options(config)
         self._views = _evenly(_checked_views(views), config.max_views)
         self.config, self._rates, self._device = config, rates or TrainingRates(), device
-        self._map = seed_gaussians(cloud, max(1, int(config.max_gaussians * SEED_SHARE)), seed, device)
+        seeds = max(1, int(config.max_gaussians * SEED_SHARE))
+        self._map = seed_gaussians(cloud, seeds, seed, device, config.sh_degree)
         self._adam = RowAdam(self._map.parameters())
         self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
-        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth)
+        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, config.exposure)
         self._background = _mean_color(self._views).to(device)
         self._order = _view_order(len(self._views), seed)
         self._targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -136,7 +140,7 @@ class Mapper:
         target, weight = self._target(number)
         if self.config.paper_loss:
             return mask_loss(squared_color_error(color, target), weight)
-        return photometric_loss(color, target, weight)
+        return photometric_loss(color, target, weight, self.config.ssim_share)
 
     def _target(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Photograph and pixel weight of eq. (17) of one view, on the map's device; made once."""
@@ -165,7 +169,16 @@ class Mapper:
             "quats": r.quats,
             "opacity_logits": r.opacity_logits,
             "colors": r.colors,
+            "sh_rest": r.sh_rest,
         }
+
+
+def check_map_options(config: MappingConfig) -> None:
+    """Raises ConfigError for options outside their range."""
+    if config.sh_degree not in range(4):
+        raise ConfigError(f"mapping.sh_degree: expected 0 to 3, got {config.sh_degree}")
+    if not 0 <= config.ssim_share <= 1:
+        raise ConfigError(f"mapping.ssim_share: expected 0 to 1, got {config.ssim_share}")
 
 
 def _checked_views(views: list[View]) -> list[View]:

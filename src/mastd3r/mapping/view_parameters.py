@@ -23,14 +23,14 @@ class ViewParameters:
     They stay on the CPU wherever the map lives: a few numbers a view, not worth a kernel each.
     """
 
-    def __init__(self, views: list[View], refine_poses: bool, depth: float) -> None:
+    def __init__(self, views: list[View], refine_poses: bool, depth: float, exposure: bool = True) -> None:
         self._timestamps_s = np.array([v.timestamp_s for v in views])
         self._kf_id = [v.kf_id for v in views]
         self._world_from_cam = [np.asarray(v.world_from_cam, float) for v in views]
         self._cam_from_world = [torch.from_numpy(np.linalg.inv(p)) for p in self._world_from_cam]
         self._rows = [{name: torch.zeros(3, requires_grad=True) for name in _NAMES} for _ in views]
         self._adams = [RowAdam(row) for row in self._rows]
-        self._refine_poses, self._depth = refine_poses, depth
+        self._refine_poses, self._depth, self._exposure = refine_poses, depth, exposure
 
     def cam_from_world(self, number: int) -> torch.Tensor:
         """(4, 4) float64 of one training view, with its correction."""
@@ -39,6 +39,8 @@ class ViewParameters:
 
     def exposed(self, color: torch.Tensor, number: int) -> torch.Tensor:
         """Colour as that view's exposure shows it: gain * colour + bias."""
+        if not self._exposure:
+            return color
         row = self._rows[number]
         return color * row["log_gain"].exp().to(color.device) + row["bias"].to(color.device)
 
