@@ -45,11 +45,13 @@ LAYERS: dict[str, set[str]] = {
     "finish": {"geometry", *CONTRACTS, *STAGES},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
+    "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
+        "showcase",
     },
     "cli_weights": {"errors", "networks", "progress"},
-    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights"},
+    "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "showcase"},
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
     "": set(),
@@ -66,7 +68,7 @@ HEAVY = {  # package: who may import it
     "transformers": {"networks"},
     "safetensors": {"networks"},
     "gsplat": {"mapping"},
-    "av": {"sources"},
+    "av": {"sources", "export"},
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights"},
 }

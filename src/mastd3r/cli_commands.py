@@ -71,8 +71,10 @@ def _parser() -> argparse.ArgumentParser:
     ev.set_defaults(act=_eval)
     export = commands.add_parser("export", help="write a run's trajectory or splat in another format")
     export.add_argument("run", type=Path)
-    export.add_argument("--to", choices=("tum", "kitti", "colmap"), required=True)
-    export.add_argument("--out", type=Path, required=True, help="file (tum, kitti) or folder (colmap)")
+    export.add_argument("--to", choices=("tum", "kitti", "colmap", "spz", "flight", "depth"), required=True)
+    export.add_argument(
+        "--out", type=Path, required=True, help="file (tum, kitti, spz, flight: .mp4) or folder (colmap, depth)"
+    )
     export.set_defaults(act=_export)
     view = commands.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path)
@@ -203,7 +205,12 @@ def _eval(args: argparse.Namespace, console: Console) -> int:
 def _export(args: argparse.Namespace, console: Console) -> int:
     from .export.formats import export_run
 
-    written = export_run(args.run, args.to, args.out)
+    if args.to in ("spz", "flight", "depth"):
+        from .showcase import export_splat
+
+        written = export_splat(args.run, args.to, args.out)
+    else:
+        written = export_run(args.run, args.to, args.out)
     Console().print(f"wrote {written}")
     return 0
 

@@ -28,10 +28,12 @@ from .lens_view import LensView
 from .mapping.mapper import Mapper, check_map_options
 from .mapping.ply import write_gaussians_ply
 from .mapping.rasterise import map_device
+from .mapping.spz import write_gaussians_spz
 from .parts import build_parts
 from .progress import Reporter, Silent
 from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
 from .second_pass import SecondPass, second_pass
+from .showcase import depth_png_per_unit, flight_camera, flight_path, write_flight
 from .slam import Slam
 from .sources import open_source
 from .types import Source, StaticCloud
@@ -167,6 +169,8 @@ class _Job:
                 mapper = self._map(cloud, seen)
             with self._timed("renders"):
                 self._render(mapper, seen, material.lens_view)
+            with self._timed("flight"):
+                self._fly(mapper)
         self._finish(frames)
 
     def before_map(self) -> tuple[int, MapMaterial]:
@@ -266,6 +270,9 @@ class _Job:
         with self.reporter.stage("map", self.config.mapping.iterations, "steps") as bar:
             mapper.refine(self.config.mapping.iterations, lambda _step, _loss: bar.advance())
         write_gaussians_ply(self.folder.path / "gaussians.ply", mapper.gaussians)
+        write_gaussians_spz(self.folder.path / "gaussians.spz", mapper.gaussians)
+        per_unit = depth_png_per_unit(mapper.facts["median_depth"])
+        self.folder.update(map={"device": self._map_device, **mapper.facts, "depth_png_per_unit": per_unit})
         self.metrics["gaussians"] = len(mapper.gaussians.means)
         few = seen.views[:: max(1, len(seen.views) // MAPPED_SAMPLES)]
         figures = []
@@ -277,13 +284,24 @@ class _Job:
         return mapper
 
     def _render(self, mapper: Mapper, seen: SecondPass, lens_view: LensView) -> None:
+        per_unit = depth_png_per_unit(mapper.facts["median_depth"])
         with self.reporter.stage("renders", len(seen.holdout), "frames") as bar:
             for place in seen.holdout:
                 if not np.isfinite(place.world_from_cam).all():
                     continue
-                color, _, _ = mapper.render(place.world_from_cam, lens_view.pinhole, place.record.timestamp_s)
-                self.folder.write_render(place.record.timestamp_s, lens_view.as_photograph(color))
+                time_s = place.record.timestamp_s
+                color, depth, _ = mapper.render(place.world_from_cam, lens_view.pinhole, time_s)
+                self.folder.write_render(time_s, lens_view.as_photograph(color))
+                self.folder.write_depth(time_s, lens_view.depth_as_photograph(depth), per_unit)
                 bar.advance()
+
+    def _fly(self, mapper: Mapper) -> None:
+        """flight.mp4: the splat along the smoothed trajectory, at neutral exposure."""
+        times_s = np.array([f.record.timestamp_s for f in self._final])
+        poses = flight_path(times_s, np.stack([f.world_from_cam for f in self._final]))
+        with self.reporter.stage("flight", len(poses), "frames") as bar:
+            path = self.folder.path / "flight.mp4"
+            write_flight(path, mapper.render, flight_camera(self.lens()), poses, bar.advance)
 
     def _finish(self, frames: int) -> None:
         elapsed = time.perf_counter() - self._started

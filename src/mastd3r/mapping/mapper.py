@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
 from .screen import ScreenStats
 from .seed import seed_gaussians
+from .splat import as_pictures
 from .threads import one_torch_thread
 from .view_parameters import ViewParameters
 
@@ -32,7 +34,7 @@ class TrainingRates:
     quats: float = 1e-3
     opacity_logits: float = 5e-2
     colors: float = 2.5e-3
-    sh_rest: float = 1.25e-4
+    sh_rest: float = 1e-3
 
 
 SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
@@ -75,6 +77,11 @@ class Mapper:
         """The map as plain arrays."""
         return self._map.arrays()
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is not in gaussians.ply and decides how the map looks."""
+        return {"near": self._near, "background": self._background.tolist(), "median_depth": self._depth}
+
     def refine(self, steps: int, on_step: Callable[[int, float], None] | None = None) -> None:
         """Run ``steps`` optimisation steps, one view each; ``on_step(step, loss)`` counts from 1.
 
@@ -103,8 +110,7 @@ class Mapper:
             color, depth, alpha = self._draw(cam_from_world, K, camera.width, camera.height, None)
             if timestamp_s is not None:
                 color = self._view_parameters.exposed_at(color, timestamp_s)
-            depth = torch.where(alpha > 0.5, depth / alpha.clamp_min(1e-6), torch.zeros_like(depth))
-        return color.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), alpha.cpu().numpy()
+        return as_pictures(color, depth, alpha)
 
     def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""
