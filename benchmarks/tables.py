@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from map_tables import map_sections
+
 COLUMNS: dict[str, tuple[str, str]] = {
     "frames_posed": ("posed", "d"),
     "frames": ("of", "d"),
@@ -63,6 +65,7 @@ def main() -> int:
         lines.append(f"| {name} | `{entry['command']}` | {when} | {machine} |")
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
+    lines += map_sections(source.parent)
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
