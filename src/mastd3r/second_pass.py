@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 from .config import HOLDOUT_EVERY, Config
 from .dynamics.belief import DynamicBelief
 from .dynamics.data import DynamicsInput
-from .finish import FinalFrame, kept_matches
+from .dynamics.flow import HalfFlow
+from .finish import FinalFrame
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .lens_view import LensView
 from .parts import Parts
 from .rectify import Rectifier
 from .types import Frame, View
-from .view_depth import dynamics_input, static_at
+from .view_depth import dynamics_input, reprojection_residual_px, static_at
 
 Array = NDArray[Any]
+RESIDUAL_MAX_PX = 50.0  # a longer residual is a wrong match, and must not make all others small in u = e / max e
 
 
 @dataclass
@@ -55,7 +57,7 @@ def second_pass(
     ``frames`` are photographs, and ``lens_view`` is of their lens. Where that was calibrated, ``rectifier`` makes
     them what tracking saw. ``on_mask`` is given P(moving), (h, w) float32 over the photograph at working scale.
     """
-    out = SecondPass()
+    out, flow = SecondPass(), HalfFlow(parts.size[0] // 2, parts.size[1] // 2)
     belief = DynamicBelief(config.dynamics, *parts.size)
     chosen = _view_positions(final, config)
     by_index = {f.record.index: f for f in final}
@@ -80,7 +82,7 @@ def second_pass(
             out.colors[kf_id], out.moving[kf_id] = _seen_by(seen.image, mask.probability, graph, kf_id, place)
         waiting.clear()
         if position in chosen:
-            uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
+            uncertainty = _uncertainty(place, graph, given, flow, lens_view.tau_px)
             if uncertainty is not None:
                 uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, rectifier))
             out.views.append(_view(frame, place, moving, uncertainty, lens_view))
@@ -142,22 +144,19 @@ def _view(frame: Frame, place: FinalFrame, moving: Array, uncertainty: Array | N
     )
 
 
-def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], tau_px: float) -> Array | None:
-    """(h, w) u(p) of eq. (16) on a cell around each match with a residual above tau_unc; None where there is none."""
-    record, block = place.record, graph.blocks[place.record.kf_id]
-    if len(record.points) == 0:
-        return None
-    matches = kept_matches(graph, record)
-    new_from_ref = inverse(place.world_from_cam) @ inverse(block.cam_from_world)
-    error = np.minimum(matches.residual_px(new_from_ref), 50.0) ** 2
-    u = uncertainty_weight(error, tau_px)
-    if not (u > 0).any():
-        return None
-    dense = np.zeros((size[1], size[0]), np.float32)
-    for (x, y), value in zip(np.round(record.target[u > 0]).astype(int), u[u > 0], strict=True):
-        cell = dense[max(0, y - 4) : y + 5, max(0, x - 4) : x + 5]
-        np.maximum(cell, np.float32(value), out=cell)
-    return dense
+def _uncertainty(
+    place: FinalFrame, graph: KeyframeGraph, given: DynamicsInput, flow: HalfFlow, tau_px: float
+) -> Array | None:
+    """(h, w) u(p) of eq. (16) over the working image; None where no residual is above tau_unc.
+
+    Against the two keyframes before the frame's own and the two after it: a frame compared with itself shows nothing.
+    """
+    kf = place.record.kf_id
+    near = [n for n in (kf - 2, kf - 1, kf + 1, kf + 2) if 0 <= n < len(graph.keyframes)]
+    others = [n for n in near if graph.submap_of[n] == graph.submap_of[kf]]
+    residual_px = reprojection_residual_px(graph, others, place.world_from_cam, given.gray, given.inv_depth, flow)
+    u = uncertainty_weight(np.minimum(residual_px, RESIDUAL_MAX_PX).ravel() ** 2, tau_px).reshape(residual_px.shape)
+    return cv2.resize(u.astype(np.float32), graph.size, interpolation=cv2.INTER_NEAREST) if (u > 0).any() else None
 
 
 def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:
