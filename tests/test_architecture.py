@@ -46,9 +46,10 @@ LAYERS: dict[str, set[str]] = {
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
     "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
+    "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
-        "showcase",
+        "showcase", "live_map",
     },
     "cli_weights": {"errors", "networks", "progress"},
     "cli_commands": {"", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "showcase"},

@@ -96,6 +96,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--correction", choices=("none", "coarse", "fine", "coarse-to-fine"))
     p.add_argument("--map-loss", choices=("plain", "mask", "uncertainty", "full"))
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
+    p.add_argument("--realtime", action="store_true", help="start the map while tracking, in a process of its own")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]", help=INTRINSICS_HELP)
     p.add_argument("--start", type=int, help="first frame, from 0")
     p.add_argument("--end", type=int, help="one past the last frame")
@@ -117,6 +118,10 @@ def config_from_args(args: argparse.Namespace) -> Config:
     config = replace(config, source=replace(config.source, **window))
     if args.map_loss is not None:
         config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
+    if args.realtime and args.no_map:
+        raise ConfigError("--realtime: expected a map to be made, got --no-map")
+    if args.realtime:
+        config = replace(config, mapping=replace(config.mapping, realtime=True))
     if args.no_map:
         config = replace(config, mapping=replace(config.mapping, enabled=False))
     if args.maps is not None and config.semantics == "auto":

@@ -98,6 +98,8 @@ class MappingConfig:
     ssim_share: float = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
     exposure: bool = True  # a gain and a bias a colour channel for every training view
     sh_degree: int = 0  # 0 to 3: spherical harmonics, colour that depends on the direction of view
+    realtime: bool = False  # start the map while tracking runs, in a process of its own
+    realtime_steps: int = 4  # optimisation steps a frame that it may spend meanwhile
     refine_poses: bool = True  # move the training cameras through the render gradient
 
 

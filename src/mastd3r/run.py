@@ -25,8 +25,10 @@ from .export.run_folder import RunFolder
 from .finish import FinalFrame, final_frames, finish_graph, static_cloud, trajectory_of
 from .geometry.camera import Camera
 from .lens_view import LensView
+from .live_map import LiveMap
 from .mapping.mapper import Mapper, check_map_options
 from .mapping.ply import write_gaussians_ply
+from .mapping.process import Outcome
 from .mapping.rasterise import map_device
 from .mapping.spz import write_gaussians_spz
 from .parts import build_parts
@@ -79,6 +81,8 @@ def run(
     except KeyboardInterrupt:
         job.save_the_rest("stopped by the user (Ctrl-C)")
         raise
+    finally:
+        job.close()
     return RunResult(job.folder.path, job.metrics)
 
 
@@ -148,12 +152,14 @@ class _Job:
     ) -> None:
         self._map_device = map_device
         self.source, self.rectifier = source, rectifier  # frames of the source are photographs
-        self.tracked = _tracked(source, rectifier)
         self.config, self.slam, self.folder, self.reporter = config, slam, folder, reporter
         self.metrics: dict[str, Any] = {}
         self.timings: dict[str, float] = {}
         self._started = time.perf_counter()
         self._final: list[FinalFrame] = []
+        realtime = config.mapping.enabled and config.mapping.realtime
+        self._live = LiveMap(config, map_device) if realtime else None
+        self._begun: Outcome | None = None  # the map that was made while tracking
         folder.write_config(config_to_yaml(config))
         folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
         folder.note(*slam.parts.notes, *([rectifier.note] if rectifier is not None else []))
@@ -189,8 +195,11 @@ class _Job:
     def _track(self) -> int:
         count = 0
         with self.reporter.stage("tracking", self.source.length, "frames") as bar:
-            for frame in self.tracked.frames():
-                self.slam.step(frame)
+            for frame in self.source.frames():
+                tracked = frame if self.rectifier is None else self.rectifier.frame(frame)
+                self.slam.step(tracked)
+                if self._live is not None:
+                    self._live.after(count, frame, tracked, self.slam.graph, self.lens)
                 count += 1
                 bar.advance()
         self.slam.close()
@@ -210,6 +219,10 @@ class _Job:
             )
         self._final = final_frames(self.slam.graph)
         self._write_trajectory()
+        if self._live is not None:
+            self._begun, facts, note = self._live.finish(self.slam.graph, self.lens)
+            self.folder.update(realtime=facts)
+            self.folder.note(note)
 
     def _write_trajectory(self) -> None:
         graph = self.slam.graph
@@ -266,9 +279,12 @@ class _Job:
             )
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
-        mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed, self._map_device)
-        with self.reporter.stage("map", self.config.mapping.iterations, "steps") as bar:
-            mapper.refine(self.config.mapping.iterations, lambda _step, _loss: bar.advance())
+        config, begun = self.config.mapping, self._begun
+        done = min(begun.steps, config.iterations // 2) if begun is not None else 0
+        start = begun.gaussians if begun is not None else None
+        mapper = Mapper(config, cloud, seen.views, self.config.seed, self._map_device, start=start, steps_done=done)
+        with self.reporter.stage("map", config.iterations - done, "steps") as bar:
+            mapper.refine(config.iterations - done, lambda _step, _loss: bar.advance())
         write_gaussians_ply(self.folder.path / "gaussians.ply", mapper.gaussians)
         write_gaussians_spz(self.folder.path / "gaussians.spz", mapper.gaussians)
         per_unit = depth_png_per_unit(mapper.facts["median_depth"])
@@ -329,6 +345,11 @@ class _Job:
             title=self.source.name,
         )
         write_report(self.folder.path, data)
+
+    def close(self) -> None:
+        """End what runs beside."""
+        if self._live is not None:
+            self._live.close()
 
     def save_the_rest(self, reason: str) -> None:
         """Write what is known and mark the run incomplete; never hides the error that brought us here."""

@@ -28,7 +28,7 @@ Array = NDArray[Any]
 Draw = Callable[[Array, Camera], tuple[Array, Array, Array]]
 FLIGHT_FPS = 30
 FLIGHT_WIDTH_PX = 480
-FLIGHT_S = (4.0, 12.0)  # the flight is as long as the video, within these
+FLIGHT_S = (2.0, 10.0)  # the flight is as long as the video, within these
 FLIGHT_SIGMA_RATIO = 0.02  # of the video's length: what the path is smoothed over
 DEPTH_RANGE = 16  # times the median depth that a depth image must hold
 

@@ -72,6 +72,12 @@ class GaussianMap:
         tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}
         return GaussianMap(**tensors, kf_id=self.kf_id[rows])
 
+    def joined(self, other: GaussianMap) -> GaussianMap:
+        """These rows, then the other's, as new leaves."""
+        pairs = zip(self.parameters().items(), other.parameters().values(), strict=True)
+        tensors = {name: torch.cat([a.detach(), b.detach()]).requires_grad_() for (name, a), b in pairs}
+        return GaussianMap(**tensors, kf_id=torch.cat([self.kf_id, other.kf_id]))
+
     def draw(
         self,
         cam_from_world: torch.Tensor,

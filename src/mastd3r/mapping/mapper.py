@@ -52,8 +52,12 @@ class Mapper:
         device: str = "cpu",
         rates: TrainingRates | None = None,
         densify: DensifySettings | None = None,
+        start: GaussianArrays | None = None,
+        steps_done: int = 0,
     ) -> None:
-        """Seed the map from ``cloud``; ``views`` beyond ``config.max_views`` are thinned evenly.
+        """Seed the map from ``cloud``, or go on from ``start``; ``views`` beyond ``max_views`` are thinned evenly.
+
+        ``steps_done`` of the schedule of ``config.iterations`` steps count as done.
 
         Raises InputError for no view, views of the wrong shape, or a cloud without a usable point, ConfigError for
         options outside their range.
@@ -61,8 +65,11 @@ class Mapper:
         check_map_options(config)
         self._views = _evenly(_checked_views(views), config.max_views)
         self.config, self._rates, self._device = config, rates or TrainingRates(), device
-        seeds = max(1, int(config.max_gaussians * SEED_SHARE))
-        self._map = seed_gaussians(cloud, seeds, seed, device, config.sh_degree)
+        self._seeds, self._seed = max(1, int(config.max_gaussians * SEED_SHARE)), seed
+        if start is not None:
+            self._map = GaussianMap.from_arrays(start, device)
+        else:
+            self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree)
         self._adam = RowAdam(self._map.parameters())
         self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
@@ -70,7 +77,7 @@ class Mapper:
         self._background = _mean_color(self._views).to(device)
         self._order = _view_order(len(self._views), seed)
         self._targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
-        self._step = 0
+        self._step = steps_done
 
     @property
     def gaussians(self) -> GaussianArrays:
@@ -111,6 +118,22 @@ class Mapper:
             if timestamp_s is not None:
                 color = self._view_parameters.exposed_at(color, timestamp_s)
         return as_pictures(color, depth, alpha)
+
+    def extend(self, views: list[View], cloud: StaticCloud) -> None:
+        """More views (up to ``max_views``), and seeds from more points, up to the share of the limit that seeds have.
+
+        Raises InputError for views of the wrong shape.
+        """
+        new = (_checked_views(views) if views else [])[: max(0, self.config.max_views - len(self._views))]
+        if new:
+            self._views = [*self._views, *new]
+            self._view_parameters.extend(new)
+            self._order = _view_order(len(self._views), self._seed + len(self._views))
+        room = self._seeds - len(self._map)
+        if room > 0 and len(cloud.points_world):
+            seeds = seed_gaussians(cloud, room, self._seed, self._device, self.config.sh_degree)
+            self._map = self._map.joined(seeds)
+            self._adam.grow(len(seeds))
 
     def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""

@@ -24,13 +24,25 @@ class ViewParameters:
     """
 
     def __init__(self, views: list[View], refine_poses: bool, depth: float, exposure: bool = True) -> None:
-        self._timestamps_s = np.array([v.timestamp_s for v in views])
-        self._kf_id = [v.kf_id for v in views]
-        self._world_from_cam = [np.asarray(v.world_from_cam, float) for v in views]
-        self._cam_from_world = [torch.from_numpy(np.linalg.inv(p)) for p in self._world_from_cam]
-        self._rows = [{name: torch.zeros(3, requires_grad=True) for name in _NAMES} for _ in views]
-        self._adams = [RowAdam(row) for row in self._rows]
+        self._timestamps_s = np.zeros(0)
+        self._kf_id: list[int] = []
+        self._world_from_cam: list[Array] = []
+        self._cam_from_world: list[torch.Tensor] = []
+        self._rows: list[dict[str, torch.Tensor]] = []
+        self._adams: list[RowAdam] = []
+        self.extend(views)
         self._refine_poses, self._depth, self._exposure = refine_poses, depth, exposure
+
+    def extend(self, views: list[View]) -> None:
+        """Rows for more views, at neutral exposure and where tracking put them."""
+        poses = [np.asarray(v.world_from_cam, float) for v in views]
+        rows = [{name: torch.zeros(3, requires_grad=True) for name in _NAMES} for _ in views]
+        self._timestamps_s = np.concatenate([self._timestamps_s, [v.timestamp_s for v in views]])
+        self._kf_id += [v.kf_id for v in views]
+        self._world_from_cam += poses
+        self._cam_from_world += [torch.from_numpy(np.linalg.inv(p)) for p in poses]
+        self._rows += rows
+        self._adams += [RowAdam(row) for row in rows]
 
     def cam_from_world(self, number: int) -> torch.Tensor:
         """(4, 4) float64 of one training view, with its correction."""
