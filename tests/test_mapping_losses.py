@@ -56,8 +56,8 @@ def test_17_total(kind: str, paper: bool) -> None:
         seen_u = u * torch.tensor([[1.0, 1, 1, 0]])
         expected = mask_loss(error, w) + 0.1 * uncertainty_loss(error, seen_u)
         assert float(mask_loss(error, total)) == pytest.approx(float(expected))
-    else:  # uncertain pixels never count more than lambda u
-        assert torch.allclose(total[0, 1:3], torch.tensor([0.04, 0.1]))
+    else:  # from w where nothing is uncertain to lambda w where all is
+        assert torch.allclose(total, w * (1 - 0.9 * u))
         assert float(total[0, 0]) == 1
     assert float(total[0, 3]) == 0
 

@@ -24,7 +24,7 @@ from .types import Frame, View
 from .view_depth import dynamics_input, reprojection_residual_px, static_at
 
 Array = NDArray[Any]
-RESIDUAL_MAX_PX = 50.0  # a longer residual is a wrong match, and must not make all others small in u = e / max e
+RESIDUAL_MAX_PX = 8.0  # as uncertain as can be: one wild match must not make all others small in u = e / max e
 
 
 @dataclass

@@ -56,7 +56,8 @@ def pixel_weight(
 
     paper: w + lambda u, as printed: uncertain pixels count MORE.
     Otherwise the reading that does what the text says ("suppressing the influence of dynamic and
-    low-confidence points"): in R a pixel leaves the first sum and stays with lambda u only.
+    low-confidence points"): in R a pixel's weight falls with its uncertainty, from w where u is 0 to lambda w where
+    u is 1. (lambda u alone would hold the least uncertain pixels of R back most.)
     Also, surely moving pixels get weight 0 under mask and full: Adam's steps do not depend on the size of a
     gradient, so where the background was never seen 5 % of the weight builds the whole ghost.
     plain has w = 1, mask has no u, uncertainty has w = 1 and u, full has both. 0 where there is no data.
@@ -69,7 +70,7 @@ def pixel_weight(
         return weight
     if paper:
         return weight + lambda_uncertainty * u * seen
-    return torch.where(u > 0, torch.minimum(weight, lambda_uncertainty * u * seen), weight)
+    return weight * (1 - (1 - lambda_uncertainty) * u)
 
 
 def photometric_loss(
