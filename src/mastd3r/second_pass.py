@@ -154,7 +154,9 @@ def _uncertainty(
     kf = place.record.kf_id
     near = [n for n in (kf - 2, kf - 1, kf + 1, kf + 2) if 0 <= n < len(graph.keyframes)]
     others = [n for n in near if graph.submap_of[n] == graph.submap_of[kf]]
-    residual_px = reprojection_residual_px(graph, others, place.world_from_cam, given.gray, given.inv_depth, flow)
+    residual_px = reprojection_residual_px(
+        graph, others, place.world_from_cam, given.gray, given.inv_depth, flow, RESIDUAL_MAX_PX
+    )
     u = uncertainty_weight(np.minimum(residual_px, RESIDUAL_MAX_PX).ravel() ** 2, tau_px).reshape(residual_px.shape)
     return cv2.resize(u.astype(np.float32), graph.size, interpolation=cv2.INTER_NEAREST) if (u > 0).any() else None
 

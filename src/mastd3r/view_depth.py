@@ -126,16 +126,24 @@ def dynamics_input(
     )
 
 
-GREY_DOUBT = 8.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
+GREY_DOUBT = 12.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
+GREY_WRONG = 24.0  # where neither a static scene nor the flow comes nearer than this, there is no match
 
 
 def reprojection_residual_px(
-    graph: KeyframeGraph, kf_ids: list[int], world_from_cam: Array, gray: Array, inv_depth: Array, flow: HalfFlow
+    graph: KeyframeGraph,
+    kf_ids: list[int],
+    world_from_cam: Array,
+    gray: Array,
+    inv_depth: Array,
+    flow: HalfFlow,
+    unmatched_px: float,
 ) -> Array:
     """(h, w) float32, at ``flow``'s size, in pixels of the working image: sqrt e(p) of eq. (15), for every pixel.
 
     A pixel is carried into a keyframe by its expected depth and its final pose; flow then says where its match is
     in truth. On blank walls flow slides: a residual counts only where the carried grey values (5 x 5) differ too.
+    Where the flow's do as well there is no match, and the residual is ``unmatched_px``.
     The least over the keyframes counts, as each hides something from the others; 0 where none of them sees the pixel.
     """
     size = (flow.grid.shape[1], flow.grid.shape[0])
@@ -152,7 +160,12 @@ def reprojection_residual_px(
         kf_gray = cv2.resize(graph.keyframes[kf_id].work.gray, size, interpolation=cv2.INTER_AREA)
         carried_gray = flow.warp(kf_gray, target)
         left = flow.between(small, carried_gray)
-        differs = cv2.blur(cv2.absdiff(small, carried_gray).astype(np.float32), (5, 5)) > GREY_DOUBT
-        residual = ratio * np.hypot(left[..., 0], left[..., 1]) * differs
+        gain = float(small[seen].mean() / max(carried_gray[seen].mean(), 1.0)) if seen.any() else 1.0
+        as_static, as_flow = (
+            cv2.blur(np.abs(small - np.float32(gain) * image), (5, 5))
+            for image in (carried_gray, flow.warp(carried_gray, flow.grid + left))
+        )
+        residual = np.where(as_flow > GREY_WRONG, unmatched_px, ratio * np.hypot(left[..., 0], left[..., 1]))
+        residual = residual * (as_static > GREY_DOUBT)
         least = np.minimum(least, np.where(seen, residual, np.inf))
     return np.where(np.isfinite(least), least, 0).astype(np.float32)
