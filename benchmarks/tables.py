@@ -19,6 +19,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "ate_rmse_keyframes": ("ATE keyframes", ".4f"),
     "focal_px": ("focal [px]", ".0f"),
     "psnr_holdout": ("PSNR holdout [dB]", ".2f"),
+    "psnr_holdout_static": ("PSNR static pixels", ".2f"),
     "ssim_holdout": ("SSIM", ".3f"),
     "mask_iou": ("mask IoU", ".3f"),
     "mask_moving_ratio": ("called moving", ".3f"),
