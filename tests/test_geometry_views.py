@@ -118,7 +118,8 @@ def graph_of(grays: dict[float, np.ndarray]) -> Any:
         cam_from_world = np.eye(4)
         cam_from_world[0, 3] = -x
         blocks[n] = SimpleNamespace(cam_from_world=cam_from_world)
-        keyframes.append(SimpleNamespace(work=SimpleNamespace(gray=gray)))
+        still = np.zeros(gray.shape, np.uint8)
+        keyframes.append(SimpleNamespace(work=SimpleNamespace(gray=gray), moving=still))
     camera = Camera.centred(200.0, 256, 192)
     return SimpleNamespace(camera=lambda: camera, size=(256, 192), blocks=blocks, keyframes=keyframes)
 
@@ -145,6 +146,8 @@ def test_reprojection_residual_finds_what_moved_and_nothing_else() -> None:
     near = cv2.dilate(moved.astype(np.uint8), np.ones((15, 15))) > 0
     assert (residual[moved] > 2).mean() > 0.4
     assert (residual[~near] > 2).mean() < 0.05
+    graph.keyframes[0].moving[:], graph.keyframes[1].moving[:] = 255, 255
+    assert not reprojection_residual_px(graph, [0, 1], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0).any()
     still = graph_of({-0.1: wall_seen_from(-0.1, picture), 0.1: wall_seen_from(0.1, picture)})
     quiet = reprojection_residual_px(
         still, [0, 1], np.eye(4), wall_seen_from(0.0, picture), inv_depth, HalfFlow(128, 96), 8.0

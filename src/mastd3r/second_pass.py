@@ -24,6 +24,7 @@ from .types import Frame, View
 from .view_depth import dynamics_input, reprojection_residual_px, static_at
 
 Array = NDArray[Any]
+COMPARED = (-4, -2, -1, 1, 2, 4)  # keyframes that u(p) is found against, from the frame's own
 RESIDUAL_MAX_PX = 8.0  # as uncertain as can be: one wild match must not make all others small in u = e / max e
 
 
@@ -149,10 +150,10 @@ def _uncertainty(
 ) -> Array | None:
     """(h, w) u(p) of eq. (16) over the working image; None where no residual is above tau_unc.
 
-    Against the two keyframes before the frame's own and the two after it: a frame compared with itself shows nothing.
+    Against keyframes before and after the frame's own: a frame compared with itself shows nothing.
     """
     kf = place.record.kf_id
-    near = [n for n in (kf - 2, kf - 1, kf + 1, kf + 2) if 0 <= n < len(graph.keyframes)]
+    near = [kf + n for n in COMPARED if 0 <= kf + n < len(graph.keyframes)]
     others = [n for n in near if graph.submap_of[n] == graph.submap_of[kf]]
     residual_px = reprojection_residual_px(
         graph, others, place.world_from_cam, given.gray, given.inv_depth, flow, RESIDUAL_MAX_PX

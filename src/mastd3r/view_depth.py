@@ -127,7 +127,7 @@ def dynamics_input(
 
 
 GREY_DOUBT = 12.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
-GREY_WRONG = 24.0  # where neither a static scene nor the flow comes nearer than this, there is no match
+GREY_WRONG = 36.0  # where neither a static scene nor the flow comes nearer than this, there is no match
 
 
 def reprojection_residual_px(
@@ -144,7 +144,8 @@ def reprojection_residual_px(
     A pixel is carried into a keyframe by its expected depth and its final pose; flow then says where its match is
     in truth. On blank walls flow slides: a residual counts only where the carried grey values (5 x 5) differ too.
     Where the flow's do as well there is no match, and the residual is ``unmatched_px``.
-    The least over the keyframes counts, as each hides something from the others; 0 where none of them sees the pixel.
+    The least over the keyframes counts, as each hides something from the others. A keyframe does not see what
+    stands behind a moving thing of its own; 0 where none sees the pixel.
     """
     size = (flow.grid.shape[1], flow.grid.shape[0])
     camera, ratio = graph.camera().resized(*size), graph.size[0] / size[0]
@@ -157,6 +158,8 @@ def reprojection_residual_px(
         seen = points_kf[..., 2] > 0
         target = camera.project(np.where(seen[..., None], points_kf, 1.0)).astype(np.float32)
         seen &= (target >= 0).all(-1) & (target[..., 0] <= size[0] - 1) & (target[..., 1] <= size[1] - 1)
+        covered = cv2.dilate(cv2.resize(graph.keyframes[kf_id].moving, size), np.ones((9, 9), np.uint8))
+        seen &= flow.warp(covered, target) < 128
         kf_gray = cv2.resize(graph.keyframes[kf_id].work.gray, size, interpolation=cv2.INTER_AREA)
         carried_gray = flow.warp(kf_gray, target)
         left = flow.between(small, carried_gray)
