@@ -38,7 +38,7 @@ def losses(path: Path) -> list[str]:
         found = [row for name, row in rows.items() if name.startswith(f"{loss}, seed")]
         if found:
             spread = [_spread([r[key] for r in found]) for key in ("psnr_whole", "psnr_hidden")]
-            similar, commits = np.mean([r["ssim_whole"] for r in found]), sorted({r["git_commit"] for r in found})
+            similar, commits = np.mean([r["ssim_whole"] for r in found]), sorted({str(r["git_commit"]) for r in found})
             out.append(f"| {loss} | {len(found)} | {spread[0]} | {spread[1]} | {similar:.3f} | {', '.join(commits)} |")
     parts = {name.removeprefix("ablation: "): row for name, row in rows.items() if name.startswith("ablation: ")}
     if parts:
