@@ -24,6 +24,7 @@ from .types import Frame, View
 from .view_depth import dynamics_input, reprojection_residual_px, static_at
 
 Array = NDArray[Any]
+BLEEDING_PX = 5  # at half the working size: flow of a moving thing spills over its outline; u is taken back by that
 COMPARED = (-4, -2, -1, 1, 2, 4)  # keyframes that u(p) is found against, from the frame's own
 RESIDUAL_MAX_PX = 8.0  # as uncertain as can be: one wild match must not make all others small in u = e / max e
 
@@ -159,7 +160,10 @@ def _uncertainty(
         graph, others, place.world_from_cam, given.gray, given.inv_depth, flow, RESIDUAL_MAX_PX
     )
     u = uncertainty_weight(np.minimum(residual_px, RESIDUAL_MAX_PX).ravel() ** 2, tau_px).reshape(residual_px.shape)
-    return cv2.resize(u.astype(np.float32), graph.size, interpolation=cv2.INTER_NEAREST) if (u > 0).any() else None
+    if not (u > 0).any():
+        return None
+    inner = cv2.erode(u.astype(np.float32), np.ones((BLEEDING_PX, BLEEDING_PX)))
+    return cv2.resize(inner, graph.size, interpolation=cv2.INTER_NEAREST)
 
 
 def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:
