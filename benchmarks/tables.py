@@ -19,6 +19,7 @@ from mastd3r.experiments.store import read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
+from map_tables import map_sections
 from masks_tables import masks
 from networks_table import networks
 
@@ -29,6 +30,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "ate_rmse_keyframes": ("ATE keyframes", ".4f"),
     "focal_px": ("focal [px]", ".0f"),
     "psnr_holdout": ("PSNR holdout [dB]", ".2f"),
+    "psnr_holdout_static": ("PSNR static pixels", ".2f"),
     "ssim_holdout": ("SSIM", ".3f"),
     "mask_iou": ("mask IoU", ".3f"),
     "mask_moving_ratio": ("called moving", ".3f"),
@@ -76,6 +78,7 @@ def main() -> int:
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     lines += experiments(source.parent / "bench", target.parent / "plots")
+    lines += map_sections(source.parent)
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")

@@ -50,9 +50,11 @@ LAYERS: dict[str, set[str]] = {
     "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare", "lookahead"},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "lookahead", "loops"},
     "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
+    "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
+    "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
-        "view_depth",
+        "view_depth", "showcase", "live_map",
     },
     "experiments": {"config", "errors", "evaluation", "export"},
     "cli_weights": {"errors", "fetch", "networks", "progress"},
@@ -60,6 +62,7 @@ LAYERS: dict[str, set[str]] = {
     "cli_bench": {"errors", "experiments", "export"},
     "cli_commands": {
         "", *CONTRACTS, *STAGES, "progress", "run", "parts", "cli_weights", "cli_bench", "cli_download",
+        "showcase",
     },
     "cli": {"errors", "cli_commands"},
     "__main__": {"cli"},
@@ -77,11 +80,11 @@ HEAVY = {  # package: who may import it
     "transformers": {"networks"},
     "safetensors": {"networks"},
     "gsplat": {"mapping"},
-    "av": {"sources", "export"},  # read videos, write masks.mp4
+    "av": {"sources", "export"},  # reads videos, writes them
     "numba": {"geometry", "dynamics", "mapping", "pointmap"},
     "rich": {"progress", "cli_commands", "cli_weights", "cli_bench", "cli_download"},
 }
-NAMES_A_DEVICE = {"mapping.rasterise", "networks.record"}  # the latter: recordings are CUDA's
+NAMES_A_DEVICE = {"mapping.rasterise", "networks.record", "config"}  # recordings are CUDA's; config: mapping.device
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"run", "cli_commands"}
 TRUTH_GOES_TO = {"evaluate", "evaluate_trajectory"}

@@ -12,7 +12,7 @@ import yaml
 import miniatures
 from mastd3r.cli import main
 from mastd3r.config import CameraConfig, Config
-from mastd3r.run import _with_dataset_lens
+from mastd3r.parts import with_dataset_lens
 from mastd3r.sources import open_source
 
 
@@ -100,8 +100,8 @@ def test_the_default_reads_no_calibration(tmp_path: Path) -> None:
     """Every source but one knows its lens, and a run is told of it only when that is asked for."""
     source = open_source(miniatures.euroc(tmp_path).folder, Config().source)
     assert source.calibration
-    assert _with_dataset_lens(Config(), source) == (Config(), [])
-    told, notes = _with_dataset_lens(Config(camera=CameraConfig(from_dataset=True)), source)
+    assert with_dataset_lens(Config(), source) == (Config(), [])
+    told, notes = with_dataset_lens(Config(camera=CameraConfig(from_dataset=True)), source)
     assert told.camera.intrinsics == source.calibration and "calibration of the dataset (euroc)" in notes[0]
 
 

@@ -132,8 +132,29 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     ):  # fmt: skip
         assert isinstance(metrics[key], int | float) and np.isfinite(metrics[key]), key
     assert metrics["psnr_holdout"] > 12 and metrics["psnr_mapped"] > 12
+    what_is_shown_of_a_map(out, holdout, tmp_path)
     scored = independent_score(out, room_clip)
     assert scored["frames"] == scored["posed"] == metrics["frames_posed"]
     assert scored["ate_all"] == pytest.approx(metrics["ate_rmse_all"], rel=1e-3)
     assert scored["psnr"] == pytest.approx(metrics["psnr_holdout"], rel=1e-3)
     assert scored["mask_fp"] == pytest.approx(metrics["mask_false_positive_ratio"], rel=1e-2, abs=1e-4)
+
+
+def what_is_shown_of_a_map(out: Path, holdout: set[str], tmp_path: Path) -> None:
+    """Depth images, flight and .spz of the run folder, and the same again by ``mastd3r export``."""
+    facts = json.loads((out / "run.json").read_text())["map"]
+    assert facts["device"] == "cpu" and facts["near"] > 0
+    assert main(["export", str(out), "--to", "depth", "--out", str(tmp_path / "depth")]) == 0
+    for folder in (out / "depth", tmp_path / "depth"):
+        assert {p.name for p in folder.iterdir()} == holdout
+    name = sorted(holdout)[1]
+    kept, again = (cv2.imread(str(f / name), cv2.IMREAD_UNCHANGED) for f in (out / "depth", tmp_path / "depth"))
+    assert kept.dtype == np.uint16 and (kept > 0).mean() > 0.5
+    both = (kept > 0) & (again > 0)
+    assert np.abs(kept[both] / again[both] - 1).mean() < 0.05  # the run's has the training's pose corrections
+    seen = kept[kept > 0] / facts["depth_png_per_unit"]
+    assert 0.3 * facts["median_depth"] < np.median(seen) < 3 * facts["median_depth"]
+    for kind, file in (("spz", "gaussians.spz"), ("flight", "flight.mp4")):
+        assert main(["export", str(out), "--to", kind, "--out", str(tmp_path / file)]) == 0
+        sizes = [(folder / file).stat().st_size for folder in (out, tmp_path)]
+        assert sizes[1] == pytest.approx(sizes[0], rel=0.05) and sizes[0] > 2000

@@ -43,6 +43,7 @@ def test_a_whole_run_comes_back(tmp_path: Path) -> None:
     folder.write_metrics({"frames": np.int64(5), "psnr_holdout": np.float32(20.5), "mask_iou": float("nan")})
     folder.write_mask(0.1, np.full((4, 6), 0.25))
     folder.write_render(0.2, np.full((4, 6, 3), [1.0, 0.5, 0.0]))
+    folder.write_depth(0.2, np.full((4, 6), 2.5), 100.0)
     folder.note("focal length found", "focal length found", "no semantics")
     folder.update(timings_s={"tracking": 1.5})
     assert read_run(folder.path).record["status"] == "running"
@@ -62,7 +63,7 @@ def test_a_whole_run_comes_back(tmp_path: Path) -> None:
     assert (run.mask_times_s().tolist(), run.render_times_s().tolist()) == ([0.1], [0.2])
     assert {p.name for p in folder.path.iterdir()} == {
         "run.json", "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "metrics.json",
-        "masks", "renders",
+        "masks", "renders", "depth",
     }  # fmt: skip
 
 

@@ -10,10 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mastd3r.dynamics.flow import HalfFlow
 from mastd3r.geometry.camera import Camera
 from mastd3r.lens_view import LensView
 from mastd3r.second_pass import is_holdout, uncertainty_weight
-from mastd3r.view_depth import cell_centres, chained_flow, invert_flow, own_depth_spread, static_at
+from mastd3r.view_depth import (
+    cell_centres,
+    chained_flow,
+    invert_flow,
+    own_depth_spread,
+    reprojection_residual_px,
+    static_at,
+)
 
 Array = NDArray[Any]
 
@@ -125,3 +133,54 @@ def test_the_spread_of_own_depths_is_measured(sigma: float) -> None:
     assert own_depth_spread(graph) == pytest.approx(sigma, rel=0.15)
     graph.keyframes = [SimpleNamespace(id=0, work=SimpleNamespace(own_inv_depth=None))]
     assert own_depth_spread(graph) is None
+
+
+def wall_seen_from(x: float, picture: np.ndarray) -> np.ndarray:
+    """A wall 2 units away, 100 px a unit of its own, from a camera that stands ``x`` to the right."""
+    start = round(100 + 100 * x)
+    return np.ascontiguousarray(picture[:192, start : start + 256])
+
+
+def graph_of(grays: dict[float, np.ndarray]) -> Any:
+    """What ``reprojection_residual_px`` asks of a graph: keyframes at x = the keys, one lens."""
+    blocks, keyframes = {}, []
+    for n, (x, gray) in enumerate(grays.items()):
+        cam_from_world = np.eye(4)
+        cam_from_world[0, 3] = -x
+        blocks[n] = SimpleNamespace(cam_from_world=cam_from_world)
+        still = np.zeros(gray.shape, np.uint8)
+        keyframes.append(SimpleNamespace(work=SimpleNamespace(gray=gray), moving=still))
+    camera = Camera.centred(200.0, 256, 192)
+    return SimpleNamespace(camera=lambda: camera, size=(256, 192), blocks=blocks, keyframes=keyframes)
+
+
+def test_reprojection_residual_finds_what_moved_and_nothing_else() -> None:
+    """A block that stands elsewhere in both keyframes; the wall, textured or blank, has no residual."""
+    rng = np.random.default_rng(0)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (192, 500)).astype(np.float32), (0, 0), 2)
+    picture = cv2.normalize(picture, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
+    picture[:, 330:] = 120  # a blank part of the wall
+    thing = ((rng.random((9, 5)) > 0.5) * 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)  # 72 x 40
+
+    def shown(x: float, column: int) -> np.ndarray:
+        image = wall_seen_from(x, picture)
+        image[60:132, column : column + 40] = thing
+        return image
+
+    view = shown(0.0, 90)
+    graph = graph_of({-0.1: shown(-0.1, 84), 0.1: shown(0.1, 96)})  # on the wall it would be at 100 and 80
+    inv_depth = np.full((192, 256), 0.5, np.float32)
+    residual = reprojection_residual_px(graph, [0, 1], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0)
+    moved = np.zeros((96, 128), bool)
+    moved[30:66, 45:65] = True
+    near = cv2.dilate(moved.astype(np.uint8), np.ones((15, 15))) > 0
+    assert (residual[moved] > 2).mean() > 0.4
+    assert (residual[~near] > 2).mean() < 0.05
+    graph.keyframes[0].moving[:], graph.keyframes[1].moving[:] = 255, 255
+    assert not reprojection_residual_px(graph, [0, 1], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0).any()
+    still = graph_of({-0.1: wall_seen_from(-0.1, picture), 0.1: wall_seen_from(0.1, picture)})
+    quiet = reprojection_residual_px(
+        still, [0, 1], np.eye(4), wall_seen_from(0.0, picture), inv_depth, HalfFlow(128, 96), 8.0
+    )
+    assert (quiet > 2).mean() < 0.03
+    assert not reprojection_residual_px(still, [], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0).any()

@@ -1,20 +1,16 @@
-"""Seeding, keyframe corrections, densification rounds and the .ply file."""
+"""Seeding, keyframe corrections and densification rounds."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import gsply
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from mastd3r.errors import InputError, OutputError
+from mastd3r.errors import InputError
 from mastd3r.mapping.adam import RowAdam
 from mastd3r.mapping.densify import DensifyPolicy, DensifySettings
 from mastd3r.mapping.gaussians import GaussianMap, quaternion_from_rotation
-from mastd3r.mapping.ply import read_gaussians_ply, write_gaussians_ply
 from mastd3r.mapping.screen import ScreenStats
 from mastd3r.mapping.seed import seed_gaussians
 from mastd3r.types import StaticCloud
@@ -182,37 +178,3 @@ def test_adam_is_torchs_adam_and_follows_rows() -> None:
     adam.pick(torch.tensor([4, 4, 0]), torch.tensor([False, True, False]))
     moments = adam._first["p"]
     assert moments.shape == (3, 3) and torch.all(moments[1] == 0) and torch.any(moments[0] != 0)
-
-
-def test_ply_round_trip_and_an_independent_reader(tmp_path: Path) -> None:
-    arrays = random_map().arrays()
-    path = tmp_path / "gaussians.ply"
-    write_gaussians_ply(path, arrays)
-    back = read_gaussians_ply(path)
-    for name in ("means", "scales", "quats", "opacities", "colors"):
-        assert np.allclose(getattr(back, name), getattr(arrays, name), atol=1e-5), name
-    other = gsply.plyread(str(path))
-    assert np.allclose(other.means, arrays.means)
-    assert np.allclose(np.exp(other.scales), arrays.scales, rtol=1e-5)
-    assert np.allclose(other.quats, arrays.quats, atol=1e-6)
-    assert np.allclose(1 / (1 + np.exp(-np.ravel(other.opacities))), arrays.opacities, atol=1e-6)
-    assert np.allclose(other.sh0 * 0.28209479177387814 + 0.5, arrays.colors, atol=1e-6)
-
-
-def test_ply_on_a_full_disk_and_bad_files(tmp_path: Path) -> None:
-    full = Path("/dev/full")
-    if full.exists():
-        with pytest.raises(OutputError, match="expected to write"):
-            write_gaussians_ply(full, random_map(2000).arrays())
-    with pytest.raises(OutputError):
-        write_gaussians_ply(tmp_path / "missing" / "a.ply", random_map(5).arrays())
-    with pytest.raises(InputError, match="readable"):
-        read_gaussians_ply(tmp_path / "none.ply")
-    (tmp_path / "bad.ply").write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    with pytest.raises(InputError, match="layout"):
-        read_gaussians_ply(tmp_path / "bad.ply")
-    write_gaussians_ply(tmp_path / "cut.ply", random_map(5).arrays())
-    data = (tmp_path / "cut.ply").read_bytes()
-    (tmp_path / "cut.ply").write_bytes(data[:-7])
-    with pytest.raises(InputError, match="expected 5 Gaussians"):
-        read_gaussians_ply(tmp_path / "cut.ply")

@@ -11,70 +11,20 @@ import numpy as np
 import pytest
 import torch
 
+from gaussian_scenes import HEIGHT, KINDS, NAMES, WIDTH, random_scene, weighted_loss, with_grads
 from mastd3r.errors import InputError, MissingPackage
-from mastd3r.mapping.rasterise import rasterization
+from mastd3r.mapping import rasterise
+from mastd3r.mapping.rasterise import map_device, rasterization
 from mastd3r.mapping.rasterise_gsplat import rasterise_gsplat
 from mastd3r.mapping.rasterise_reference import rasterise_reference
 from mastd3r.mapping.screen import ScreenStats
 from mastd3r.mapping.threads import one_torch_thread
-
-WIDTH, HEIGHT = 53, 37  # not multiples of the tile
-NAMES = ("means", "quats", "scales", "opacities", "colors", "viewmats")
-Scene = dict[str, torch.Tensor]
 
 
 @pytest.fixture(autouse=True)
 def _one_torch_thread() -> Iterator[None]:
     with one_torch_thread():
         yield
-
-
-def random_scene(kind: str, seed: int, count: int = 120) -> tuple[Scene, torch.Tensor]:
-    """Gaussians in front of a slightly turned camera, as float64 tensors, and K."""
-    rng = np.random.default_rng(seed)
-    focal = 0.9 * WIDTH
-    K = torch.tensor([[focal, 0, 25.3], [0, 1.1 * focal, 17.9], [0, 0, 1]], dtype=torch.float64)
-    z = rng.uniform(1, 6, count)
-    spread = {"off-screen": 2.5}.get(kind, 0.6)
-    xy = rng.uniform(-spread, spread, (count, 2)) * z[:, None]
-    sigma_px = {"tiny": (0.01, 0.3), "huge": (20, 150)}.get(kind, (1, 6))
-    scales = rng.uniform(*sigma_px, (count, 3)) / focal * z[:, None]
-    if kind == "behind camera":
-        z[::2] *= -1
-        z[1::7] = 0.005
-    opacities = rng.uniform(0.1, 0.95, count)
-    if kind == "transparent":
-        opacities[::2] = rng.uniform(0.0, 0.01, len(opacities[::2]))
-    if kind == "opaque":
-        opacities[:] = rng.uniform(0.97, 1.0, count)
-    view = np.eye(4)
-    view[:3, :3] = [[np.cos(0.1), 0, np.sin(0.1)], [0, 1, 0], [-np.sin(0.1), 0, np.cos(0.1)]]
-    view[:3, 3] = [0.02, -0.03, 0.001]
-    scene = {
-        "means": np.concatenate([xy, z[:, None]], 1),
-        "quats": rng.normal(size=(count, 4)),
-        "scales": scales,
-        "opacities": opacities,
-        "colors": rng.uniform(0, 1, (count, 3)),
-        "viewmats": view,
-    }
-    # values that float32 holds exactly, so that both sides see the same scene
-    return {k: torch.tensor(v, dtype=torch.float32).double() for k, v in scene.items()}, K
-
-
-def weighted_loss(result: tuple[torch.Tensor, ...], seed: int = 5) -> torch.Tensor:
-    """A fixed random linear function of colour, depth and alpha."""
-    generator = torch.Generator().manual_seed(seed)
-    return sum((r.double() * torch.rand(r.shape, generator=generator, dtype=torch.float64)).sum() for r in result)
-
-
-def with_grads(function: Any, scene: Scene, K: torch.Tensor, **options: Any) -> tuple[Any, list[torch.Tensor]]:
-    leaves = [scene[n].clone().requires_grad_() for n in NAMES]
-    result = function(*leaves, K, WIDTH, HEIGHT, **options)
-    return result, list(torch.autograd.grad(weighted_loss(result), leaves))
-
-
-KINDS = ("plain", "off-screen", "behind camera", "tiny", "huge", "transparent", "opaque")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -200,4 +150,47 @@ def test_gsplat_adapter_keeps_our_pixel_convention(monkeypatch: pytest.MonkeyPat
     args = [scene[n] for n in NAMES]
     ours = rasterise_gsplat(*args, K, WIDTH, HEIGHT, 0.01, 0.3, None)
     for a, b in zip(ours, rasterise_reference(*args, K, WIDTH, HEIGHT), strict=True):
-        assert a.shape == b.shape and torch.allclose(a, b)
+        assert a.shape == b.shape and torch.allclose(a.double(), b, atol=1e-5)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device with gsplat")
+@pytest.mark.parametrize("kind", KINDS)
+def test_gsplat_on_a_device_matches_the_reference(kind: str) -> None:
+    pytest.importorskip("gsplat")
+
+    def on_device(*arguments: Any, **options: Any) -> tuple[torch.Tensor, ...]:
+        moved = [a.to("cuda") if isinstance(a, torch.Tensor) else a for a in arguments]
+        return tuple(t.cpu() for t in rasterization(*moved, **options))
+
+    scene, K = random_scene(kind, 0)
+    theirs, their_grads = with_grads(on_device, scene, K)
+    reference, reference_grads = with_grads(rasterise_reference, scene, K)
+    for a, b in zip(theirs, reference, strict=True):
+        assert (a - b).abs().max() <= 1e-4 * max(1.0, float(b.detach().abs().max()))
+    for name, a, b in zip(NAMES, their_grads, reference_grads, strict=True):
+        assert (a - b).norm() <= 1e-3 * b.norm(), name
+
+
+def test_where_the_map_lives(monkeypatch: pytest.MonkeyPatch) -> None:
+    """auto never fails and says why; a device asked for by name that cannot draw is refused in one line."""
+    assert map_device("cpu") == ("cpu", "")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert map_device("auto") == ("cpu", "torch finds no accelerator")
+    with pytest.raises(InputError, match=r"mapping\.device cuda: expected an accelerator"):
+        map_device("cuda")
+
+
+def test_an_accelerator_is_believed_when_it_has_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """torch says that there is one; what counts is the picture."""
+    monkeypatch.setattr(rasterise, "torch_device", lambda: "cpu:0")  # a device that every machine has
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "a card")
+    assert map_device("auto") == ("cuda", "gsplat draws on a card")
+    black = torch.zeros(4, 4, 3), torch.zeros(4, 4), torch.zeros(4, 4)
+    monkeypatch.setattr(rasterise, "rasterization", lambda *_: black)
+    assert map_device("auto") == ("cpu", "gsplat drew 0 where 0.5 was expected")
+
+    def fail(*_: Any) -> None:
+        raise MissingPackage("no gsplat here")
+
+    monkeypatch.setattr(rasterise, "rasterization", fail)
+    assert map_device("auto") == ("cpu", "no gsplat here")

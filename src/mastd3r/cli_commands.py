@@ -74,8 +74,10 @@ def _parser() -> argparse.ArgumentParser:
     _eval_parser(commands.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     export = commands.add_parser("export", help="write a run's trajectory or splat in another format")
     export.add_argument("run", type=Path)
-    export.add_argument("--to", choices=("tum", "kitti", "colmap"), required=True)
-    export.add_argument("--out", type=Path, required=True, help="file (tum, kitti) or folder (colmap)")
+    export.add_argument("--to", choices=("tum", "kitti", "colmap", "spz", "flight", "depth"), required=True)
+    export.add_argument(
+        "--out", type=Path, required=True, help="file (tum, kitti, spz, flight: .mp4) or folder (colmap, depth)"
+    )
     export.set_defaults(act=_export)
     view = commands.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path)
@@ -109,6 +111,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
     p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")
+    p.add_argument("--realtime", action="store_true", help="start the map while tracking, in a process of its own")
     p.add_argument("--start", type=int, help="first frame, from 0")
     p.add_argument("--end", type=int, help="one past the last frame")
     p.add_argument("--stride", type=int, help="every n-th frame")
@@ -130,6 +133,10 @@ def config_from_args(args: argparse.Namespace) -> Config:
     config = replace(config, source=replace(config.source, **window))
     if args.map_loss is not None:
         config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
+    if args.realtime and args.no_map:
+        raise ConfigError("--realtime: expected a map to be made, got --no-map")
+    if args.realtime:
+        config = replace(config, mapping=replace(config.mapping, realtime=True))
     if args.no_map:
         config = replace(config, mapping=replace(config.mapping, enabled=False))
     if args.maps is not None and config.semantics == "auto":
@@ -255,7 +262,12 @@ def _eval_trajectory(args: argparse.Namespace) -> int:
 def _export(args: argparse.Namespace, console: Console) -> int:
     from .export.formats import export_run
 
-    written = export_run(args.run, args.to, args.out)
+    if args.to in ("spz", "flight", "depth"):
+        from .showcase import export_splat
+
+        written = export_splat(args.run, args.to, args.out)
+    else:
+        written = export_run(args.run, args.to, args.out)
     Console().print(f"wrote {written}")
     return 0
 
@@ -275,6 +287,7 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
 def _doctor(args: argparse.Namespace, console: Console) -> int:
     from .export.machine import machine_info
+    from .mapping.rasterise import map_device
     from .parts import chosen_pointmaps
 
     table = Table(show_header=False)
@@ -282,6 +295,7 @@ def _doctor(args: argparse.Namespace, console: Console) -> int:
         table.add_row(key, str(value))
     Console().print(table)
     kind, why = chosen_pointmaps(Config())
-    Console().print(f"pointmaps auto: {kind} ({why}) · splat backend: cpu (numba)")
+    device, reason = map_device("auto")
+    Console().print(f"pointmaps auto: {kind} ({why}) · map auto: {device} ({reason})")
     Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
     return 0

@@ -22,6 +22,7 @@ MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
 SourceKind = Literal[
     "auto", "video", "images", "tum", "bonn", "kitti-raw", "kitti-odometry", "7scenes", "euroc", "replica"
 ]  # fmt: skip
+MapDeviceKind = Literal["auto", "cpu", "cuda"]
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
 ExecutionKind = Literal["auto", "eager", "graph", "compile"]
 
@@ -92,6 +93,7 @@ class MappingConfig:
     """The Gaussian map (III-C)."""
 
     enabled: bool = True
+    device: MapDeviceKind = "auto"  # auto: the accelerator where gsplat draws on it, the CPU otherwise
     loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
     width_px: int = 320  # width of the images that the map is trained on and rendered at
     iterations: int = 3000  # optimisation steps, one view each
@@ -102,6 +104,11 @@ class MappingConfig:
     tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
     lambda_uncertainty: float = 0.1  # eq. (17)
     paper_loss: bool = False  # True: squared error with the weights as printed; False: L1 + 0.2 D-SSIM
+    ssim_share: float = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
+    exposure: bool = True  # a gain and a bias a colour channel for every training view
+    sh_degree: int = 0  # 0 to 3: spherical harmonics, colour that depends on the direction of view
+    realtime: bool = False  # start the map while tracking runs, in a process of its own
+    realtime_steps: int = 4  # optimisation steps a frame that it may spend meanwhile
     refine_poses: bool = True  # move the training cameras through the render gradient
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .config import Config, NetworksConfig
+from .config import Config, MappingConfig, NetworksConfig
 from .dynamics.head import plain_descriptors
 from .errors import ConfigError, InputError
 from .graph.places import PlaceIndex
@@ -22,6 +23,7 @@ from .pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, workin
 from .types import Frame, Source, WorkFrame
 
 Array = NDArray[Any]
+log = logging.getLogger(__name__)
 Near = Callable[[Frame], WorkFrame | None]  # what a frame is probably seen beside
 DESCRIBED_PX = 4  # working pixels a plain descriptor
 REMEMBERED_FEATURES = 4  # frames whose features are kept: the mask of one is made when the next is already looked at
@@ -108,6 +110,35 @@ def build_parts(config: Config, source: Source) -> Parts:
         parts.notes.append(note)
     parts.notes[:0] = notes
     return parts
+
+
+def with_dataset_lens(config: Config, source: Source) -> tuple[Config, list[str]]:
+    """The dataset's calibration in place of intrinsics where it is asked for, and a note. Raises ConfigError."""
+    if not config.camera.from_dataset:
+        return config, []
+    given = source.calibration
+    if not given:
+        raise ConfigError(f"--intrinsics dataset: expected a calibration in {source.name} ({source.kind}), got none")
+    numbers = ",".join(f"{v:g}" for v in given)
+    lens = replace(config.camera, intrinsics=given)
+    return replace(config, camera=lens), [f"intrinsics: the calibration of the dataset ({source.kind}): {numbers}"]
+
+
+def chosen_map_device(config: MappingConfig, notes: list[str]) -> str:
+    """Where the map will live; the choice and its reason go to ``notes``.
+
+    Raises InputError, see ``map_device``, and ConfigError for options of the map outside their range.
+    """
+    from .mapping.mapper import check_map_options
+    from .mapping.rasterise import map_device
+
+    check_map_options(config)
+    if not config.enabled:
+        return "cpu"
+    device, why = map_device(config.device)
+    notes.append(f"map on {device}" + (f", chosen by auto ({why})" if why else ""))
+    log.info(notes[-1])
+    return device
 
 
 def chosen_pointmaps(config: Config) -> tuple[str, str]:

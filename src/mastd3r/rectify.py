@@ -7,6 +7,7 @@ x_d = x R + 2 p1 x y + p2 (r² + 2 x²), y_d = y R + p1 (r² + 2 y²) + 2 p2 x y
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -328,3 +329,10 @@ class RectifiedSource:
 
 def _text(numbers: Sequence[float]) -> str:
     return ",".join(f"{v:g}" for v in numbers)
+
+
+def tracked_frames(photographs: Iterator[Frame], rectifier: Rectifier | None, untaken: deque[Frame]) -> Iterator[Frame]:
+    """What tracking is shown of each photograph. The photographs go to ``untaken``, for the caller to take in order."""
+    for photograph in photographs:
+        untaken.append(photograph)
+        yield photograph if rectifier is None else rectifier.frame(photograph)

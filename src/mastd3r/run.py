@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, config_to_yaml
-from .errors import ConfigError, InputError, SlamError
+from .errors import InputError, SlamError
 from .evaluation.evaluate import evaluate
 from .evaluation.image_error import psnr
 from .export.evidence import EvidenceSample
@@ -27,16 +28,20 @@ from .export.run_folder import RunFolder
 from .finish import FinalFrame, final_frames, finish_graph, static_cloud, trajectory_of
 from .geometry.camera import Camera
 from .lens_view import LensView
+from .live_map import LiveMap
 from .mapping.mapper import Mapper
 from .mapping.ply import write_gaussians_ply
+from .mapping.process import Outcome
 from .mapping.rasterise import accelerator
-from .parts import build_parts
+from .mapping.spz import write_gaussians_spz
+from .parts import build_parts, chosen_map_device, with_dataset_lens
 from .progress import Reporter, Silent
-from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for
+from .rectify import OpenCvLens, RectifiedSource, Rectifier, rectifier_for, tracked_frames
 from .second_pass import Look, SecondPass, SeenMask, second_pass
+from .showcase import depth_png_per_unit, flight_camera, flight_path, write_flight
 from .slam import Slam
 from .sources import open_source
-from .types import Source, StaticCloud
+from .types import Frame, Source, StaticCloud
 from .view_depth import own_depth_spread
 
 Array = NDArray[Any]
@@ -52,6 +57,15 @@ class RunResult:
     metrics: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class MapMaterial:
+    """What a map is made from."""
+
+    cloud: StaticCloud
+    seen: SecondPass
+    lens_view: LensView
+
+
 def run(
     source_path: str | Path,
     out: Path,
@@ -62,21 +76,7 @@ def run(
     maps: Path | None = None,
 ) -> RunResult:
     """Do everything for one source. Raises SlamError children; what was computed until then is in the folder."""
-    want_semantic = config.semantics in ("auto", "maps")
-    source = open_source(
-        source_path,
-        config.source,
-        want_depth=config.pointmaps == "depth",
-        want_semantic=want_semantic,
-        semantic_dir=maps,
-    )
-    config, told = _with_dataset_lens(config, source)
-    rectifier = rectifier_for(config.camera.intrinsics, source.size)
-    tracked = _tracked(source, rectifier)
-    parts = build_parts(config, tracked)  # refuses before anything is written
-    slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
-    job = _Job(source, rectifier, config, slam, RunFolder(out, command or []), reporter or Silent())
-    job.folder.note(*told)
+    job = _job(source_path, out, config, command or [], reporter or Silent(), maps)
     try:
         job.everything()
     except SlamError as e:
@@ -85,19 +85,36 @@ def run(
     except KeyboardInterrupt:
         job.save_the_rest("stopped by the user (Ctrl-C)")
         raise
+    finally:
+        job.close()
     return RunResult(job.folder.path, job.metrics)
 
 
-def _with_dataset_lens(config: Config, source: Source) -> tuple[Config, list[str]]:
-    """The dataset's calibration in place of intrinsics where it is asked for, and a note. Raises ConfigError."""
-    if not config.camera.from_dataset:
-        return config, []
-    given = source.calibration
-    if not given:
-        raise ConfigError(f"--intrinsics dataset: expected a calibration in {source.name} ({source.kind}), got none")
-    numbers = ",".join(f"{v:g}" for v in given)
-    lens = replace(config.camera, intrinsics=given)
-    return replace(config, camera=lens), [f"intrinsics: the calibration of the dataset ({source.kind}): {numbers}"]
+def material_for_map(source_path: str | Path, out: Path, config: Config) -> MapMaterial:
+    """Everything of ``run`` that comes before the map, for those who train several on the same. Raises as ``run``."""
+    return _job(source_path, out, config, [], Silent(), None).before_map()[1]
+
+
+def _job(
+    source_path: str | Path, out: Path, config: Config, command: list[str], reporter: Reporter, maps: Path | None
+) -> _Job:
+    want_semantic = config.semantics in ("auto", "maps")
+    source = open_source(
+        source_path,
+        config.source,
+        want_depth=config.pointmaps == "depth",
+        want_semantic=want_semantic,
+        semantic_dir=maps,
+    )
+    config, told = with_dataset_lens(config, source)
+    rectifier = rectifier_for(config.camera.intrinsics, source.size)
+    tracked = _tracked(source, rectifier)
+    parts = build_parts(config, tracked)  # refuses before anything is written
+    device = chosen_map_device(config.mapping, parts.notes)
+    slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
+    job = _Job(source, rectifier, config, slam, RunFolder(out, command), reporter, device)
+    job.folder.note(*told)
+    return job
 
 
 def _tracked(source: Source, rectifier: Rectifier | None) -> Source:
@@ -124,21 +141,40 @@ class _Job:
         slam: Slam,
         folder: RunFolder,
         reporter: Reporter,
+        map_device: str = "cpu",
     ) -> None:
+        self._map_device = map_device
         self.source, self.rectifier = source, rectifier  # frames of the source are photographs
-        self.tracked = _tracked(source, rectifier)
         self.config, self.slam, self.folder, self.reporter = config, slam, folder, reporter
         self.metrics: dict[str, Any] = {}
         self.timings: dict[str, float] = {}
         self._started = time.perf_counter()
         self._final: list[FinalFrame] = []
         self._evidence: EvidenceSample | None = None  # of the frame that shows most
+        realtime = config.mapping.enabled and config.mapping.realtime
+        self._live = LiveMap(config, map_device) if realtime else None
+        self._begun: Outcome | None = None  # the map that was made while tracking
         folder.write_config(config_to_yaml(config))
         folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
         folder.note(*slam.parts.notes, *([rectifier.note] if rectifier is not None else []))
 
     def everything(self) -> None:
         """All stages in order."""
+        frames, material = self.before_map()
+        cloud, seen = material.cloud, material.seen
+        if self.config.mapping.enabled and not (seen.views and len(cloud.points_world)):
+            self.folder.note(f"no map: {len(seen.views)} frames can show it, {len(cloud.points_world)} points start it")
+        elif self.config.mapping.enabled:
+            with self._timed("map"):
+                mapper = self._map(cloud, seen)
+            with self._timed("renders"):
+                self._render(mapper, seen, material.lens_view)
+            with self._timed("flight"):
+                self._fly(mapper)
+        self._finish(frames)
+
+    def before_map(self) -> tuple[int, MapMaterial]:
+        """Tracking, joint optimisation, masks and cloud: the number of frames, and what a map is made from."""
         with self._timed("tracking"):
             frames = self._track()
         with self._timed("joint optimisation"):
@@ -148,20 +184,18 @@ class _Job:
             seen = self._look_again(lens_view)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
         self.folder.write_cloud(cloud)
-        if self.config.mapping.enabled and not (seen.views and len(cloud.points_world)):
-            self.folder.note(f"no map: {len(seen.views)} frames can show it, {len(cloud.points_world)} points start it")
-        elif self.config.mapping.enabled:
-            with self._timed("map"):
-                mapper = self._map(cloud, seen)
-            with self._timed("renders"):
-                self._render(mapper, seen, lens_view)
-        self._finish(frames)
+        return frames, MapMaterial(cloud, seen, lens_view)
 
     def _track(self) -> int:
         count = 0
         with self.reporter.stage("tracking", self.source.length, "frames") as bar:
-            for frame in self.slam.parts.frames_ahead(self.tracked.frames(), self.slam.near):
+            photographs: deque[Frame] = deque()
+            tracked = tracked_frames(self.source.frames(), self.rectifier, photographs)
+            for frame in self.slam.parts.frames_ahead(tracked, self.slam.near):
+                photograph = photographs.popleft()
                 self.slam.step(frame)
+                if self._live is not None:
+                    self._live.after(count, photograph, frame, self.slam.graph, self.lens)
                 count += 1
                 bar.advance()
         self.slam.close()
@@ -184,6 +218,10 @@ class _Job:
             self.folder.note(f"own depths differ from the solved ones by {found:.1%} (1 sigma), assumed {assumed:.1%}")
         self._final = final_frames(self.slam.graph)
         self._write_trajectory()
+        if self._live is not None:
+            self._begun, facts, note = self._live.finish(self.slam.graph, self.lens)
+            self.folder.update(realtime=facts)
+            self.folder.note(note)
 
     def _write_trajectory(self) -> None:
         graph = self.slam.graph
@@ -246,10 +284,16 @@ class _Job:
                 video.close()
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
-        mapper = Mapper(self.config.mapping, cloud, seen.views, self.config.seed)
-        with self.reporter.stage("map", self.config.mapping.iterations, "steps") as bar:
-            mapper.refine(self.config.mapping.iterations, lambda _step, _loss: bar.advance())
+        config, begun = self.config.mapping, self._begun
+        done = min(begun.steps, config.iterations // 2) if begun is not None else 0
+        start = begun.gaussians if begun is not None else None
+        mapper = Mapper(config, cloud, seen.views, self.config.seed, self._map_device, start=start, steps_done=done)
+        with self.reporter.stage("map", config.iterations - done, "steps") as bar:
+            mapper.refine(config.iterations - done, lambda _step, _loss: bar.advance())
         write_gaussians_ply(self.folder.path / "gaussians.ply", mapper.gaussians)
+        write_gaussians_spz(self.folder.path / "gaussians.spz", mapper.gaussians)
+        per_unit = depth_png_per_unit(mapper.facts["median_depth"])
+        self.folder.update(map={"device": self._map_device, **mapper.facts, "depth_png_per_unit": per_unit})
         self.metrics["gaussians"] = len(mapper.gaussians.means)
         few = seen.views[:: max(1, len(seen.views) // MAPPED_SAMPLES)]
         figures = []
@@ -261,13 +305,24 @@ class _Job:
         return mapper
 
     def _render(self, mapper: Mapper, seen: SecondPass, lens_view: LensView) -> None:
+        per_unit = depth_png_per_unit(mapper.facts["median_depth"])
         with self.reporter.stage("renders", len(seen.holdout), "frames") as bar:
             for place in seen.holdout:
                 if not np.isfinite(place.world_from_cam).all():
                     continue
-                color, _, _ = mapper.render(place.world_from_cam, lens_view.pinhole, place.record.timestamp_s)
-                self.folder.write_render(place.record.timestamp_s, lens_view.as_photograph(color))
+                time_s = place.record.timestamp_s
+                color, depth, _ = mapper.render(place.world_from_cam, lens_view.pinhole, time_s)
+                self.folder.write_render(time_s, lens_view.as_photograph(color))
+                self.folder.write_depth(time_s, lens_view.depth_as_photograph(depth), per_unit)
                 bar.advance()
+
+    def _fly(self, mapper: Mapper) -> None:
+        """flight.mp4: the splat along the smoothed trajectory, at neutral exposure."""
+        times_s = np.array([f.record.timestamp_s for f in self._final])
+        poses = flight_path(times_s, np.stack([f.world_from_cam for f in self._final]))
+        with self.reporter.stage("flight", len(poses), "frames") as bar:
+            path = self.folder.path / "flight.mp4"
+            write_flight(path, mapper.render, flight_camera(self.lens()), poses, bar.advance)
 
     def _finish(self, frames: int) -> None:
         elapsed = time.perf_counter() - self._started
@@ -301,6 +356,11 @@ class _Job:
             evidence=self._evidence,
         )
         write_report(self.folder.path, data)
+
+    def close(self) -> None:
+        """End what runs beside."""
+        if self._live is not None:
+            self._live.close()
 
     def save_the_rest(self, reason: str) -> None:
         """Write what is known and mark the run incomplete; never hides the error that brought us here."""

@@ -13,19 +13,23 @@ from numpy.typing import NDArray
 
 from .config import HOLDOUT_EVERY, Config
 from .dynamics.data import DynamicMask, DynamicsInput
+from .dynamics.flow import HalfFlow
 from .dynamics.head import OnlineHead
 from .dynamics.two_way import TwoWayBelief
-from .finish import FinalFrame, kept_matches
+from .finish import FinalFrame
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.point_votes import PointVotes
 from .lens_view import LensView
 from .parts import Parts
-from .rectify import Rectifier
+from .rectify import Rectifier, tracked_frames
 from .types import Frame, View, WorkFrame
-from .view_depth import dynamics_input, static_at
+from .view_depth import dynamics_input, reprojection_residual_px, static_at
 
 Array = NDArray[Any]
+BLEEDING_PX = 5  # at half the working size: flow of a moving thing spills over its outline; u is taken back by that
+COMPARED = (-4, -2, -1, 1, 2, 4)  # keyframes that u(p) is found against, from the frame's own
+RESIDUAL_MAX_PX = 8.0  # as uncertain as can be: one wild match must not make all others small in u = e / max e
 
 
 @dataclass
@@ -51,6 +55,7 @@ class _Waiting:
     place: FinalFrame
     small: Array  # (h, w, 3) uint8 at working size, as tracking saw it
     photograph: tuple[Array, Array] | None  # pinhole image and where it has data; only of training views
+    uncertainty: Array | None  # (h, w) u(p) over the image; only of training views
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,7 @@ def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask
             colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
             votes.add(kf_id, p, colors, inside)
         if one.photograph is not None:
-            uncertainty = _uncertainty(place, graph, parts.size, lens_view.tau_px)
+            uncertainty = one.uncertainty
             if uncertainty is not None:
                 uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
             out.views.append(_view(one.photograph, place, moving, uncertainty, lens_view))
@@ -119,26 +124,26 @@ def _inputs(frames: Iterator[Frame], look: Look, chosen: set[int], waiting: dequ
     by_index = {f.record.index: f for f in look.final}
     graph, parts = look.graph, look.parts
     photographs: deque[Frame] = deque()
-
-    def tracked() -> Iterator[Frame]:
-        for photograph in frames:
-            photographs.append(photograph)
-            yield photograph if look.rectifier is None else look.rectifier.frame(photograph)
+    flow = HalfFlow(parts.size[0] // 2, parts.size[1] // 2)
+    tracked = tracked_frames(frames, look.rectifier, photographs)
 
     def near(seen: Frame) -> WorkFrame | None:
         place = by_index.get(seen.index)
         return None if place is None else graph.keyframes[place.record.kf_id].work
 
-    for position, seen in enumerate(parts.frames_ahead(tracked(), lambda: near)):
+    for position, seen in enumerate(parts.frames_ahead(tracked, lambda: near)):
         frame, place = photographs.popleft(), by_index.get(seen.index)
         if place is None:
             return
         work = parts.observe(seen, near(seen))
         small = cv2.resize(seen.image, parts.size, interpolation=cv2.INTER_AREA)
-        photograph = look.lens_view.pinhole_image(frame.image) if position in chosen else None
-        waiting.append(_Waiting(position, place, small, photograph))
         features = parts.describe(seen) if look.config.dynamics.use_head else None
         given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0, features)
+        photograph = uncertainty = None
+        if position in chosen:
+            photograph = look.lens_view.pinhole_image(frame.image)
+            uncertainty = _uncertainty(place, graph, given, flow, look.lens_view.tau_px)
+        waiting.append(_Waiting(position, place, small, photograph, uncertainty))
         given = replace(given, color=small)
         yield given if parts.own_scale_known else _at_expected_scale(given)
 
@@ -208,22 +213,24 @@ def _view(
     )
 
 
-def _uncertainty(place: FinalFrame, graph: KeyframeGraph, size: tuple[int, int], tau_px: float) -> Array | None:
-    """(h, w) u(p) of eq. (16) on a cell around each match with a residual above tau_unc; None where there is none."""
-    record, block = place.record, graph.blocks[place.record.kf_id]
-    if len(record.points) == 0:
-        return None
-    matches = kept_matches(graph, record)
-    new_from_ref = inverse(place.world_from_cam) @ inverse(block.cam_from_world)
-    error = np.minimum(matches.residual_px(new_from_ref), 50.0) ** 2
-    u = uncertainty_weight(error, tau_px)
+def _uncertainty(
+    place: FinalFrame, graph: KeyframeGraph, given: DynamicsInput, flow: HalfFlow, tau_px: float
+) -> Array | None:
+    """(h, w) u(p) of eq. (16) over the working image; None where no residual is above tau_unc.
+
+    Against keyframes before and after the frame's own: a frame compared with itself shows nothing.
+    """
+    kf = place.record.kf_id
+    near = [kf + n for n in COMPARED if 0 <= kf + n < len(graph.keyframes)]
+    others = [n for n in near if graph.submap_of[n] == graph.submap_of[kf]]
+    residual_px = reprojection_residual_px(
+        graph, others, place.world_from_cam, given.gray, given.inv_depth, flow, RESIDUAL_MAX_PX
+    )
+    u = uncertainty_weight(np.minimum(residual_px, RESIDUAL_MAX_PX).ravel() ** 2, tau_px).reshape(residual_px.shape)
     if not (u > 0).any():
         return None
-    dense = np.zeros((size[1], size[0]), np.float32)
-    for (x, y), value in zip(np.round(record.target[u > 0]).astype(int), u[u > 0], strict=True):
-        cell = dense[max(0, y - 4) : y + 5, max(0, x - 4) : x + 5]
-        np.maximum(cell, np.float32(value), out=cell)
-    return dense
+    inner = cv2.erode(u.astype(np.float32), np.ones((BLEEDING_PX, BLEEDING_PX)))
+    return cv2.resize(inner, graph.size, interpolation=cv2.INTER_NEAREST)
 
 
 def uncertainty_weight(squared_error: Array, tau_px: float) -> Array:

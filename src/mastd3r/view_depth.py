@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .dynamics.data import DynamicsInput
+from .dynamics.flow import HalfFlow
 from .geometry.se3 import inverse, transform
 from .graph.depth import carried, filled, upsampled
 from .graph.keyframe_graph import KeyframeGraph
@@ -151,3 +152,51 @@ def dynamics_input(
         work.semantic,
         features,
     )
+
+
+GREY_DOUBT = 12.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
+GREY_WRONG = 36.0  # where neither a static scene nor the flow comes nearer than this, there is no match
+
+
+def reprojection_residual_px(
+    graph: KeyframeGraph,
+    kf_ids: list[int],
+    world_from_cam: Array,
+    gray: Array,
+    inv_depth: Array,
+    flow: HalfFlow,
+    unmatched_px: float,
+) -> Array:
+    """(h, w) float32, at ``flow``'s size, in pixels of the working image: sqrt e(p) of eq. (15), for every pixel.
+
+    A pixel is carried into a keyframe by its expected depth and its final pose; flow then says where its match is
+    in truth. On blank walls flow slides: a residual counts only where the carried grey values (5 x 5) differ too.
+    Where the flow's do as well there is no match, and the residual is ``unmatched_px``.
+    The least over the keyframes counts, as each hides something from the others. A keyframe does not see what
+    stands behind a moving thing of its own; 0 where none sees the pixel.
+    """
+    size = (flow.grid.shape[1], flow.grid.shape[0])
+    camera, ratio = graph.camera().resized(*size), graph.size[0] / size[0]
+    small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    near = np.maximum(cv2.resize(inv_depth, size, interpolation=cv2.INTER_NEAREST), 1e-9)
+    points_cam = camera.rays(flow.grid) / near[..., None]
+    least = np.full(small.shape, np.inf, np.float32)
+    for kf_id in kf_ids:
+        points_kf = transform(graph.blocks[kf_id].cam_from_world @ world_from_cam, points_cam)
+        seen = points_kf[..., 2] > 0
+        target = camera.project(np.where(seen[..., None], points_kf, 1.0)).astype(np.float32)
+        seen &= (target >= 0).all(-1) & (target[..., 0] <= size[0] - 1) & (target[..., 1] <= size[1] - 1)
+        covered = cv2.dilate(cv2.resize(graph.keyframes[kf_id].moving, size), np.ones((9, 9), np.uint8))
+        seen &= flow.warp(covered, target) < 128
+        kf_gray = cv2.resize(graph.keyframes[kf_id].work.gray, size, interpolation=cv2.INTER_AREA)
+        carried_gray = flow.warp(kf_gray, target)
+        left = flow.between(small, carried_gray)
+        gain = float(small[seen].mean() / max(carried_gray[seen].mean(), 1.0)) if seen.any() else 1.0
+        as_static, as_flow = (
+            cv2.blur(np.abs(small - np.float32(gain) * image), (5, 5))
+            for image in (carried_gray, flow.warp(carried_gray, flow.grid + left))
+        )
+        residual = np.where(as_flow > GREY_WRONG, unmatched_px, ratio * np.hypot(left[..., 0], left[..., 1]))
+        residual = residual * (as_static > GREY_DOUBT)
+        least = np.minimum(least, np.where(seen, residual, np.inf))
+    return np.where(np.isfinite(least), least, 0).astype(np.float32)

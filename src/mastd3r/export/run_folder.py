@@ -24,10 +24,10 @@ from .trajectory_files import write_tum
 
 Array = NDArray[Any]
 FILES = (
-    "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "metrics.json", "report.html", "aligned.txt", "masks.mp4",
+    "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply", "gaussians.spz",
+    "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
 )  # fmt: skip
-FOLDERS = ("masks", "renders")
+FOLDERS = ("masks", "renders", "depth")
 RESERVE_BYTES = 2**20  # given back when the disk is full, so that the end of a run can still be written
 
 
@@ -115,7 +115,7 @@ class RunFolder:
                 f"{probability.shape}, {int((~np.isfinite(probability)).sum())} not finite"
             )
         levels = np.ceil(np.clip(probability, 0, 1) * 255 - 0.5).astype(np.uint8)
-        self._write_png("masks", timestamp_s, levels)
+        write_png(self.path / "masks", timestamp_s, levels)
 
     def write_render(self, timestamp_s: float, image: Array) -> None:
         """renders/<timestamp>.png: (h, w, 3) RGB, uint8 or float in 0..1."""
@@ -123,7 +123,11 @@ class RunFolder:
             if not np.isfinite(image).all():
                 raise OutputError(f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not")
             image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
-        self._write_png("renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
+        write_png(self.path / "renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
+
+    def write_depth(self, timestamp_s: float, depth: Array, per_unit: float) -> None:
+        """depth/<timestamp>.png, see ``write_depth_png``."""
+        write_depth_png(self.path / "depth", timestamp_s, depth, per_unit)
 
     def write_aligned(self, rows: Array) -> None:
         """aligned.txt: (n, 7) time, estimated position in the truth's frame, true position; for plots."""
@@ -138,13 +142,6 @@ class RunFolder:
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """Any other small file of the run."""
         write_json(self.path / name, data)
-
-    def _write_png(self, folder: str, timestamp_s: float, image: Array) -> None:
-        path = self.path / folder / f"{stamp(timestamp_s)}.png"
-        done, data = cv2.imencode(".png", image)
-        if not done:
-            raise OutputError(f"{path}: expected an image that PNG can hold, got shape {image.shape}")
-        write_bytes(path, data.tobytes())
 
     def _prepare(self) -> None:
         with writing(self.path):
@@ -163,6 +160,25 @@ class RunFolder:
 
     def _save(self) -> None:
         write_json(self.path / "run.json", self.record)
+
+
+def write_depth_png(folder: Path, timestamp_s: float, depth: Array, per_unit: float) -> None:
+    """<timestamp>.png in ``folder``: (h, w) depth in map units as 16 bit, ``per_unit`` steps a unit.
+
+    0 = nothing there; what is too far for 16 bit is 65535. Raises OutputError.
+    """
+    if not np.isfinite(depth).all():
+        raise OutputError(f"depth at {stamp(timestamp_s)} s: expected finite depths, got some that are not")
+    write_png(folder, timestamp_s, np.rint(np.clip(depth * per_unit, 0, 65535)).astype(np.uint16))
+
+
+def write_png(folder: Path, timestamp_s: float, image: Array) -> None:
+    """<timestamp>.png in ``folder``; colours in OpenCV's order. Raises OutputError."""
+    path = folder / f"{stamp(timestamp_s)}.png"
+    done, data = cv2.imencode(".png", image)
+    if not done:
+        raise OutputError(f"{path}: expected an image that PNG can hold, got shape {image.shape}")
+    write_bytes(path, data.tobytes())
 
 
 def _now() -> str:

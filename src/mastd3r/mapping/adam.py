@@ -38,3 +38,9 @@ class RowAdam:
                 picked = tensor[rows]
                 picked[fresh] = 0
                 moments[name] = picked
+
+    def grow(self, count: int) -> None:
+        """Follow ``GaussianMap.joined`` with ``count`` new rows at the end, with empty moments."""
+        for moments in (self._first, self._second):
+            for name, tensor in moments.items():
+                moments[name] = torch.cat([tensor, tensor.new_zeros(count, *tensor.shape[1:])])

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from .rasterise import rasterization
 from .screen import ScreenStats
+from .sh import sh_turned, view_colors
 
 Array = NDArray[Any]
-PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "colors")
+PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "colors", "sh_rest")
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class GaussianArrays:
     opacities: Array  # (n,) float32 0..1
     colors: Array  # (n, 3) float32 RGB, 0..1
     kf_id: Array  # (n,) int32
+    sh_rest: Array  # (n, K - 1, 3) float32, spherical harmonics above the constant one; K = 1, 4, 9 or 16
 
 
 @dataclass
@@ -36,7 +38,8 @@ class GaussianMap:
     log_scales: torch.Tensor  # (n, 3) natural logarithm of the standard deviations
     quats: torch.Tensor  # (n, 4) wxyz, any length
     opacity_logits: torch.Tensor  # (n,)
-    colors: torch.Tensor  # (n, 3) RGB, 0..1 but not clamped
+    colors: torch.Tensor  # (n, 3) RGB, 0..1 but not clamped: the mean over all directions
+    sh_rest: torch.Tensor  # (n, K - 1, 3), see sh.view_colors; K = 1: the colour does not depend on the direction
     kf_id: torch.Tensor  # (n,) int32
 
     def __len__(self) -> int:
@@ -46,10 +49,34 @@ class GaussianMap:
         """The tensors that are optimised, by name."""
         return {name: getattr(self, name) for name in PARAMETERS}
 
+    @staticmethod
+    def from_arrays(arrays: GaussianArrays, device: str = "cpu") -> GaussianMap:
+        """The map that ``arrays()`` gave, as new leaves on ``device``."""
+        logits = np.log(np.clip(arrays.opacities, 1e-6, 1 - 1e-6) / np.clip(1 - arrays.opacities, 1e-6, 1))
+        plain = {
+            "means": arrays.means,
+            "log_scales": np.log(arrays.scales),
+            "quats": arrays.quats,
+            "opacity_logits": logits,
+            "colors": arrays.colors,
+            "sh_rest": arrays.sh_rest,
+        }
+        leaves = {
+            name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
+            for name, array in plain.items()
+        }
+        return GaussianMap(**leaves, kf_id=torch.tensor(arrays.kf_id, dtype=torch.int32, device=device))
+
     def picked(self, rows: torch.Tensor) -> GaussianMap:
         """A copy of some rows, in the order given (repeats allowed), as new leaves."""
         tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}
         return GaussianMap(**tensors, kf_id=self.kf_id[rows])
+
+    def joined(self, other: GaussianMap) -> GaussianMap:
+        """These rows, then the other's, as new leaves."""
+        pairs = zip(self.parameters().items(), other.parameters().values(), strict=True)
+        tensors = {name: torch.cat([a.detach(), b.detach()]).requires_grad_() for (name, a), b in pairs}
+        return GaussianMap(**tensors, kf_id=torch.cat([self.kf_id, other.kf_id]))
 
     def draw(
         self,
@@ -67,7 +94,7 @@ class GaussianMap:
             self.quats,
             self.log_scales.exp(),
             self.opacity_logits.sigmoid(),
-            self.colors,
+            view_colors(self.colors, self.sh_rest, self.means, cam_from_world),
             cam_from_world,
             intrinsics,
             width,
@@ -83,7 +110,8 @@ class GaussianMap:
         Keyframes that are missing in either dict do not move. Poses are (4, 4); a scale in their
         rotation block is honoured.
         """
-        means, quats, log_scales = (t.detach().clone() for t in (self.means, self.quats, self.log_scales))
+        names = ("means", "quats", "log_scales", "sh_rest")
+        means, quats, log_scales, sh_rest = (getattr(self, name).detach().clone() for name in names)
         for kf in sorted(set(old_world_from_kf) & set(new_world_from_kf)):
             rows = torch.nonzero(self.kf_id == kf)[:, 0]
             if len(rows) == 0:
@@ -95,8 +123,9 @@ class GaussianMap:
             turn = torch.from_numpy(quaternion_from_rotation(change[:3, :3] / scale)).to(quats)
             quats[rows] = quaternion_product(turn, quats[rows])
             log_scales[rows] += float(np.log(scale))
-        tensors = {"means": means, "quats": quats, "log_scales": log_scales}
-        return replace(self, **{name: t.requires_grad_() for name, t in tensors.items()})
+            sh_rest[rows] = sh_turned(sh_rest[rows], change[:3, :3] / scale)
+        tensors = zip(names, (means, quats, log_scales, sh_rest), strict=True)
+        return replace(self, **{name: t.requires_grad_() for name, t in tensors})
 
     def arrays(self) -> GaussianArrays:
         """Plain numpy arrays for export."""
@@ -109,6 +138,7 @@ class GaussianMap:
                 opacities=_numpy(self.opacity_logits.sigmoid()),
                 colors=_numpy(self.colors.clamp(0, 1)),
                 kf_id=self.kf_id.cpu().numpy(),
+                sh_rest=_numpy(self.sh_rest),
             )
 
 

@@ -56,20 +56,30 @@ def pixel_weight(
 
     paper: w + lambda u, as printed: uncertain pixels count MORE.
     Otherwise the reading that does what the text says ("suppressing the influence of dynamic and
-    low-confidence points"): in R a pixel leaves the first sum and stays with lambda u only.
+    low-confidence points"): u is evidence. Alone (uncertainty) it takes a pixel's weight from 1 to lambda; beside the
+    mask (full) it divides the odds of standing still by lambda^-u, so that it decides where the mask doubts and
+    leaves alone what is surely static: flow is wrong at outlines and where the other views were covered.
     Also, surely moving pixels get weight 0 under mask and full: Adam's steps do not depend on the size of a
     gradient, so where the background was never seen 5 % of the weight builds the whole ghost.
     plain has w = 1, mask has no u, uncertainty has w = 1 and u, full has both. 0 where there is no data.
     """
     seen = (static > 0).to(static)
+    if not paper and kind == "full" and u is not None:
+        static = seen * doubted(static, u, lambda_uncertainty)
     weight = static_weight(static, dynamic_weight, hard) if kind in ("mask", "full") else seen
     if not paper and kind in ("mask", "full"):
-        weight = weight * (1 - static <= SURELY_MOVING)
+        return weight * (1 - static <= SURELY_MOVING)
     if u is None or kind in ("plain", "mask"):
         return weight
     if paper:
         return weight + lambda_uncertainty * u * seen
-    return torch.where(u > 0, torch.minimum(weight, lambda_uncertainty * u * seen), weight)
+    return weight * (1 - (1 - lambda_uncertainty) * u)
+
+
+def doubted(static: torch.Tensor, u: torch.Tensor, lambda_uncertainty: float) -> torch.Tensor:
+    """P(static) after evidence u (0..1) against it: its odds times lambda^u."""
+    against = static * lambda_uncertainty**u
+    return against / (against + 1 - static).clamp_min(1e-12)
 
 
 def photometric_loss(

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 
 from ..config import MappingConfig
-from ..errors import InputError
+from ..errors import ConfigError, InputError
 from ..geometry.camera import Camera
 from ..types import StaticCloud, View
 from .adam import RowAdam
@@ -18,6 +19,7 @@ from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
 from .screen import ScreenStats
 from .seed import seed_gaussians
+from .splat import as_pictures
 from .threads import one_torch_thread
 from .view_parameters import ViewParameters
 
@@ -32,6 +34,7 @@ class TrainingRates:
     quats: float = 1e-3
     opacity_logits: float = 5e-2
     colors: float = 2.5e-3
+    sh_rest: float = 1e-3
 
 
 SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
@@ -49,26 +52,42 @@ class Mapper:
         device: str = "cpu",
         rates: TrainingRates | None = None,
         densify: DensifySettings | None = None,
+        start: GaussianArrays | None = None,
+        steps_done: int = 0,
     ) -> None:
-        """Seed the map from ``cloud``; ``views`` beyond ``config.max_views`` are thinned evenly.
+        """Seed the map from ``cloud``, or go on from ``start``; ``views`` beyond ``max_views`` are thinned evenly.
 
-        Raises InputError for no view, views of the wrong shape, or a cloud without a usable point.
+        ``steps_done`` of the schedule of ``config.iterations`` steps count as done.
+
+        Raises InputError for no view, views of the wrong shape, or a cloud without a usable point, ConfigError for
+        options outside their range.
         """
+        check_map_options(config)
         self._views = _evenly(_checked_views(views), config.max_views)
         self.config, self._rates, self._device = config, rates or TrainingRates(), device
-        self._map = seed_gaussians(cloud, max(1, int(config.max_gaussians * SEED_SHARE)), seed, device)
+        self._seeds, self._seed = max(1, int(config.max_gaussians * SEED_SHARE)), seed
+        if start is not None:
+            self._map = GaussianMap.from_arrays(start, device)
+        else:
+            self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree)
         self._adam = RowAdam(self._map.parameters())
         self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
-        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, device)
+        self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, config.exposure)
         self._background = _mean_color(self._views).to(device)
         self._order = _view_order(len(self._views), seed)
-        self._step = 0
+        self._targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+        self._step = steps_done
 
     @property
     def gaussians(self) -> GaussianArrays:
         """The map as plain arrays."""
         return self._map.arrays()
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What is not in gaussians.ply and decides how the map looks."""
+        return {"near": self._near, "background": self._background.tolist(), "median_depth": self._depth}
 
     def refine(self, steps: int, on_step: Callable[[int, float], None] | None = None) -> None:
         """Run ``steps`` optimisation steps, one view each; ``on_step(step, loss)`` counts from 1.
@@ -90,7 +109,7 @@ class Mapper:
         With ``timestamp_s`` the exposure (and the pose correction, where poses are refined) is interpolated
         between the training views around it, else the exposure is neutral and the pose as given.
         """
-        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float))).to(self._device)
+        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))
         K = torch.from_numpy(camera.matrix).to(self._device)
         with torch.no_grad():
             if timestamp_s is not None:
@@ -98,8 +117,23 @@ class Mapper:
             color, depth, alpha = self._draw(cam_from_world, K, camera.width, camera.height, None)
             if timestamp_s is not None:
                 color = self._view_parameters.exposed_at(color, timestamp_s)
-            depth = torch.where(alpha > 0.5, depth / alpha.clamp_min(1e-6), torch.zeros_like(depth))
-        return color.clamp(0, 1).cpu().numpy(), depth.cpu().numpy(), alpha.cpu().numpy()
+        return as_pictures(color, depth, alpha)
+
+    def extend(self, views: list[View], cloud: StaticCloud) -> None:
+        """More views (up to ``max_views``), and seeds from more points, up to the share of the limit that seeds have.
+
+        Raises InputError for views of the wrong shape.
+        """
+        new = (_checked_views(views) if views else [])[: max(0, self.config.max_views - len(self._views))]
+        if new:
+            self._views = [*self._views, *new]
+            self._view_parameters.extend(new)
+            self._order = _view_order(len(self._views), self._seed + len(self._views))
+        room = self._seeds - len(self._map)
+        if room > 0 and len(cloud.points_world):
+            seeds = seed_gaussians(cloud, room, self._seed, self._device, self.config.sh_degree)
+            self._map = self._map.joined(seeds)
+            self._adam.grow(len(seeds))
 
     def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""
@@ -117,12 +151,12 @@ class Mapper:
         return self._map.draw(cam_from_world, K, width, height, self._near, self._background, stats)
 
     def _one_step(self, number: int) -> float:
-        view, camera, stats = self._views[number], self._views[number].camera, ScreenStats()
+        camera, stats = self._views[number].camera, ScreenStats()
         K = torch.from_numpy(camera.matrix).to(self._device)
         cam_from_world = self._view_parameters.cam_from_world(number)
         color, _, _ = self._draw(cam_from_world, K, camera.width, camera.height, stats)
         color = self._view_parameters.exposed(color, number)
-        loss = self._loss(color, view) + self._view_parameters.prior(number)
+        loss = self._loss(color, number) + self._view_parameters.prior(number).to(color.device)
         loss.backward()
         self._policy.observe(self._map, stats, camera.width)
         self._adam.step(self._map.parameters(), self._current_rates())
@@ -131,15 +165,26 @@ class Mapper:
             self._map = self._policy.round(self._map, self._adam, camera.width)
         return float(loss.detach())
 
-    def _loss(self, color: torch.Tensor, view: View) -> torch.Tensor:
-        c = self.config
-        target, static = (torch.from_numpy(np.ascontiguousarray(a)).to(color) for a in (view.image, view.static))
-        u = None if view.uncertainty is None else torch.from_numpy(view.uncertainty).to(color)
-        paper = c.paper_loss
-        weight = pixel_weight(c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, paper)
-        if paper:
+    def _loss(self, color: torch.Tensor, number: int) -> torch.Tensor:
+        target, weight = self._target(number)
+        if self.config.paper_loss:
             return mask_loss(squared_color_error(color, target), weight)
-        return photometric_loss(color, target, weight)
+        return photometric_loss(color, target, weight, self.config.ssim_share)
+
+    def _target(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Photograph and pixel weight of eq. (17) of one view, on the map's device; made once."""
+        if number not in self._targets:
+            c, view = self.config, self._views[number]
+            target, static = self._tensor(view.image), self._tensor(view.static)
+            u = None if view.uncertainty is None else self._tensor(view.uncertainty)
+            weight = pixel_weight(
+                c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, c.paper_loss
+            )
+            self._targets[number] = target, weight
+        return self._targets[number]
+
+    def _tensor(self, array: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device, torch.float32)
 
     @property
     def _done_ratio(self) -> float:
@@ -153,7 +198,16 @@ class Mapper:
             "quats": r.quats,
             "opacity_logits": r.opacity_logits,
             "colors": r.colors,
+            "sh_rest": r.sh_rest,
         }
+
+
+def check_map_options(config: MappingConfig) -> None:
+    """Raises ConfigError for options outside their range."""
+    if config.sh_degree not in range(4):
+        raise ConfigError(f"mapping.sh_degree: expected 0 to 3, got {config.sh_degree}")
+    if not 0 <= config.ssim_share <= 1:
+        raise ConfigError(f"mapping.ssim_share: expected 0 to 1, got {config.ssim_share}")
 
 
 def _checked_views(views: list[View]) -> list[View]:

@@ -1,4 +1,4 @@
-"""``gaussians.ply`` in the layout that 3-D Gaussian viewers read (degree 0, binary little endian)."""
+"""``gaussians.ply`` in the layout that 3-D Gaussian viewers read (binary little endian)."""
 
 from __future__ import annotations
 
@@ -10,26 +10,39 @@ from ..errors import InputError, OutputError
 from .gaussians import GaussianArrays
 
 SH_DC = 0.28209479177387814  # first spherical harmonic
-_NAMES = (
-    *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
-    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
-)
+_OF_REST = {0: 0, 9: 3, 24: 8, 45: 15}  # number of f_rest columns -> upper coefficients a channel
 _OPACITY_EDGE = 1e-6  # logits stay finite
 
 
+def _names(rest: int) -> tuple[str, ...]:
+    """Columns of a file with ``rest`` columns of upper spherical harmonics."""
+    return (
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+    )
+
+
 def write_gaussians_ply(path: Path, gaussians: GaussianArrays) -> None:
-    """Means, logit opacity, log scales, wxyz rotation, f_dc = (rgb - 0.5)/SH_DC. Raises OutputError."""
-    table = np.zeros(len(gaussians.means), [(name, "<f4") for name in _NAMES])
+    """Means, logit opacity, log scales, wxyz rotation, f_dc = (rgb - 0.5)/SH_DC. Raises OutputError.
+
+    f_rest holds the upper spherical harmonics, all of red, then green, then blue; none at degree 0.
+    """
+    rest = gaussians.sh_rest.transpose(0, 2, 1).reshape(len(gaussians.means), -1)
+    names = _names(rest.shape[1])
+    table = np.zeros(len(gaussians.means), [(name, "<f4") for name in names])
     opacity = np.clip(gaussians.opacities.astype(float), _OPACITY_EDGE, 1 - _OPACITY_EDGE)
     table["opacity"] = np.log(opacity / (1 - opacity))
     for i in range(3):
-        table[_NAMES[i]] = gaussians.means[:, i]
+        table["xyz"[i]] = gaussians.means[:, i]
         table[f"f_dc_{i}"] = (gaussians.colors[:, i] - 0.5) / SH_DC
         table[f"scale_{i}"] = np.log(gaussians.scales[:, i])
     for i in range(4):
         table[f"rot_{i}"] = gaussians.quats[:, i]
+    for i in range(rest.shape[1]):
+        table[f"f_rest_{i}"] = rest[:, i]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
-    lines += [f"property float {name}" for name in _NAMES]
+    lines += [f"property float {name}" for name in names]
     header = "\n".join([*lines, "end_header"]) + "\n"
     try:
         with path.open("wb") as file:
@@ -49,16 +62,24 @@ def read_gaussians_ply(path: Path) -> GaussianArrays:
     lines = head.decode("ascii", "replace").split("\n")
     counts = [int(line.split()[2]) for line in lines if line.startswith("element vertex ")]
     names = tuple(line.split()[2] for line in lines if line.startswith("property float "))
-    if not mark or "format binary_little_endian 1.0" not in lines or len(counts) != 1 or names != _NAMES:
-        raise InputError(f"{path}: expected a binary 3-D Gaussian .ply of degree 0, got another layout")
-    if len(body) != counts[0] * 4 * len(_NAMES):
+    rest = sum(name.startswith("f_rest_") for name in names)
+    known = rest in _OF_REST and names == _names(rest)
+    if not mark or "format binary_little_endian 1.0" not in lines or len(counts) != 1 or not known:
+        raise InputError(f"{path}: expected a binary 3-D Gaussian .ply, got another layout")
+    if len(body) != counts[0] * 4 * len(names):
         raise InputError(f"{path}: expected {counts[0]} Gaussians, got {len(body)} bytes of data")
-    table = np.frombuffer(body, "<f4").reshape(-1, len(_NAMES))
+    table = np.frombuffer(body, [(name, "<f4") for name in names])
+
+    def columns(*wanted: str) -> np.ndarray:
+        return np.stack([table[name] for name in wanted], 1) if wanted else np.zeros((len(table), 0), np.float32)
+
+    upper = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(len(table), 3, _OF_REST[rest])
     return GaussianArrays(
-        means=table[:, 0:3].copy(),
-        scales=np.exp(table[:, 10:13]),
-        quats=table[:, 13:17].copy(),
-        opacities=1 / (1 + np.exp(-table[:, 9])),
-        colors=table[:, 6:9] * np.float32(SH_DC) + np.float32(0.5),
+        means=columns("x", "y", "z"),
+        scales=np.exp(columns("scale_0", "scale_1", "scale_2")),
+        quats=columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        opacities=1 / (1 + np.exp(-table["opacity"])),
+        colors=columns("f_dc_0", "f_dc_1", "f_dc_2") * np.float32(SH_DC) + np.float32(0.5),
         kf_id=np.full(len(table), -1, np.int32),
+        sh_rest=np.ascontiguousarray(upper.transpose(0, 2, 1)),
     )

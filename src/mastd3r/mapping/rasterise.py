@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+
 import torch
 
-from ..errors import InputError
+from ..config import MapDeviceKind
+from ..errors import InputError, MissingPackage
 from .screen import ScreenStats
 
 
@@ -18,6 +21,36 @@ def accelerator() -> tuple[str, float] | None:
     if torch_device() == "cpu":
         return None
     return torch.cuda.get_device_name(), torch.cuda.max_memory_allocated() / 2**20
+
+
+def map_device(asked: MapDeviceKind) -> tuple[str, str]:
+    """Where the map lives, and why ``auto`` chose it; no reason where the user did.
+
+    The accelerator is believed once gsplat has drawn on it (it compiles its kernels then, which takes minutes,
+    once a machine). Raises InputError where it was asked for by name and cannot be used.
+    """
+    if asked == "cpu":
+        return asked, ""
+    lack = _lack_of_accelerator()
+    if asked == "cuda" and lack:
+        raise InputError(f"mapping.device cuda: expected an accelerator that draws, got none: {lack}")
+    if asked == "cuda":
+        return asked, ""
+    return ("cpu", lack) if lack else ("cuda", f"gsplat draws on {torch.cuda.get_device_name()}")
+
+
+def _lack_of_accelerator() -> str:
+    """What keeps the map from the accelerator, or nothing: one Gaussian is drawn to find out."""
+    device = torch_device()
+    if device == "cpu":
+        return "torch finds no accelerator"
+    one, eye = torch.ones(1, 4).to(device), torch.eye(4).to(device)
+    gaussian = one[:, :3], one, one[:, :3], one[0, :1] / 2, one[:, :3]
+    try:
+        drawn = float(rasterization(*gaussian, eye, eye[:3, :3], 4, 4)[2].max())
+    except (MissingPackage, ImportError, AttributeError, OSError, RuntimeError, subprocess.CalledProcessError) as e:
+        return " ".join(str(e).split())[:200] or type(e).__name__
+    return "" if 0.4 < drawn < 0.6 else f"gsplat drew {drawn:.3g} where 0.5 was expected"
 
 
 def rasterization(

@@ -1,4 +1,8 @@
-"""CUDA backend of ``rasterise.rasterization``: a thin adapter to gsplat (Apache-2.0, extra ``[gpu]``)."""
+"""CUDA backend of ``rasterise.rasterization``: a thin adapter to gsplat (Apache-2.0, extra ``[gpu]``).
+
+gsplat has the CPU backend's rules (eps2d, the 1/255 cut, 0.999, 1e-4, the clamped Jacobian), computes in float32
+throughout, and sums gradients by atomics: the same call twice differs in the last bits.
+"""
 
 from __future__ import annotations
 
@@ -29,16 +33,12 @@ def rasterise_gsplat(
         raise MissingPackage(
             f"CUDA rasteriser: expected the package gsplat, got {e}; pip install 'mastd3r-slam[gpu]'"
         ) from e
-    shifted = intrinsics.to(means).clone()
+    shifted = intrinsics.detach().to(means.device, torch.float64, copy=True)
     shifted[:2, 2] += 0.5  # our integers are pixel centres, gsplat samples at +0.5
     image, alpha, info = gsplat.rasterization(
-        means,
-        quats,
-        scales,
-        opacities,
-        colors,
-        view.to(means)[None],
-        shifted[None],
+        *(t.float().contiguous() for t in (means, quats, scales, opacities, colors)),
+        view.to(means.device).float()[None],
+        shifted.float()[None],
         width,
         height,
         near_plane=near,

@@ -13,13 +13,13 @@ START_OPACITY = 0.5
 SIGMA_OF_SPACING = 0.5  # standard deviation as a share of the patch that a point stands for
 
 
-def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu") -> GaussianMap:
+def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu", sh_degree: int = 0) -> GaussianMap:
     """One Gaussian a point; where there are more than ``limit``, a fair draw.
 
     Fair: every keyframe keeps the same share of its points, and inside a keyframe a point's chance does
     not depend on its place. The survivors stand for more, so their spacing grows by the square root of
     the share. Points that are not finite, or have no positive spacing, are left out. Raises InputError
-    where none is left.
+    where none is left. Colours start without a dependence on direction, whatever ``sh_degree`` is.
     """
     points = np.asarray(cloud.points_world, np.float32)
     spacing = np.asarray(cloud.spacing, np.float32)
@@ -38,6 +38,7 @@ def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu
         "quats": quats,
         "opacity_logits": np.full(len(rows), logit),
         "colors": np.asarray(cloud.colors)[rows] / 255.0,
+        "sh_rest": np.zeros((len(rows), (sh_degree + 1) ** 2 - 1, 3)),
     }
     leaves = {
         name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()

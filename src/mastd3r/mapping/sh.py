@@ -5,6 +5,10 @@ Order and signs are those of 3-D Gaussian files (f_dc, then f_rest by degree): C
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
+import numpy as np
 import torch
 
 from ..errors import InputError
@@ -51,3 +55,40 @@ def sh_colors(coefficients: torch.Tensor, means: torch.Tensor, camera_centre: to
         raise InputError(f"spherical harmonics: expected 1, 4, 9 or 16 coefficients, got {count}")
     basis = sh_basis(means - camera_centre, degrees[count])
     return (0.5 + torch.einsum("nk,nkc->nc", basis, coefficients)).clamp_min(0)
+
+
+def view_colors(
+    colors: torch.Tensor, sh_rest: torch.Tensor, means: torch.Tensor, cam_from_world: torch.Tensor
+) -> torch.Tensor:
+    """RGB (N, 3) of Gaussians as one camera sees them: ``colors`` plus the bands above the constant one.
+
+    colors (N, 3) is the mean over all directions; sh_rest (N, K - 1, 3) with K as in ``sh_colors``. With K = 1 the
+    colours come back as they are, else they are cut at 0. Differentiable in all four.
+    """
+    if sh_rest.shape[1] == 0:
+        return colors
+    centre = -(cam_from_world[:3, :3].T @ cam_from_world[:3, 3])
+    basis = sh_basis(means - centre.to(means), sh_degree(sh_rest))[:, 1:]
+    return (colors + torch.einsum("nk,nkc->nc", basis, sh_rest)).clamp_min(0)
+
+
+def sh_degree(sh_rest: Any) -> int:
+    """Degree of (N, K - 1, 3) coefficients. Raises InputError where K is not 1, 4, 9 or 16."""
+    degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+    if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:
+        raise InputError(f"spherical harmonics: expected 0, 3, 8 or 15 upper coefficients, got {sh_rest.shape[1]}")
+    return degree
+
+
+def sh_turned(sh_rest: torch.Tensor, rotation: Any) -> torch.Tensor:
+    """(N, K - 1, 3) coefficients after the Gaussians were turned by ``rotation`` (3, 3): c'(R d) = c(d) for all d.
+
+    Solved over directions that determine every band; exact, because bands do not mix.
+    """
+    degree = sh_degree(sh_rest)
+    if degree == 0:
+        return sh_rest
+    directions = np.random.default_rng(0).normal(size=(64, 3))
+    before, after = (sh_basis(torch.from_numpy(d), degree)[:, 1:] for d in (directions, directions @ rotation.T))
+    turn = torch.linalg.lstsq(after, before).solution
+    return torch.einsum("jk,nkc->njc", turn.to(sh_rest), sh_rest)

@@ -20,16 +20,29 @@ class ViewParameters:
     """Exposure and pose corrections of all training views, one row a view.
 
     A pose correction acts on the left of cam_from_world: shift in units of ``depth``, turn a rotation vector.
+    They stay on the CPU wherever the map lives: a few numbers a view, not worth a kernel each.
     """
 
-    def __init__(self, views: list[View], refine_poses: bool, depth: float, device: str) -> None:
-        self._timestamps_s = np.array([v.timestamp_s for v in views])
-        self._kf_id = [v.kf_id for v in views]
-        self._world_from_cam = [np.asarray(v.world_from_cam, float) for v in views]
-        self._cam_from_world = [torch.from_numpy(np.linalg.inv(p)).to(device) for p in self._world_from_cam]
-        self._rows = [{name: torch.zeros(3, device=device, requires_grad=True) for name in _NAMES} for _ in views]
-        self._adams = [RowAdam(row) for row in self._rows]
-        self._refine_poses, self._depth = refine_poses, depth
+    def __init__(self, views: list[View], refine_poses: bool, depth: float, exposure: bool = True) -> None:
+        self._timestamps_s = np.zeros(0)
+        self._kf_id: list[int] = []
+        self._world_from_cam: list[Array] = []
+        self._cam_from_world: list[torch.Tensor] = []
+        self._rows: list[dict[str, torch.Tensor]] = []
+        self._adams: list[RowAdam] = []
+        self.extend(views)
+        self._refine_poses, self._depth, self._exposure = refine_poses, depth, exposure
+
+    def extend(self, views: list[View]) -> None:
+        """Rows for more views, at neutral exposure and where tracking put them."""
+        poses = [np.asarray(v.world_from_cam, float) for v in views]
+        rows = [{name: torch.zeros(3, requires_grad=True) for name in _NAMES} for _ in views]
+        self._timestamps_s = np.concatenate([self._timestamps_s, [v.timestamp_s for v in views]])
+        self._kf_id += [v.kf_id for v in views]
+        self._world_from_cam += poses
+        self._cam_from_world += [torch.from_numpy(np.linalg.inv(p)) for p in poses]
+        self._rows += rows
+        self._adams += [RowAdam(row) for row in rows]
 
     def cam_from_world(self, number: int) -> torch.Tensor:
         """(4, 4) float64 of one training view, with its correction."""
@@ -38,7 +51,10 @@ class ViewParameters:
 
     def exposed(self, color: torch.Tensor, number: int) -> torch.Tensor:
         """Colour as that view's exposure shows it: gain * colour + bias."""
-        return color * self._rows[number]["log_gain"].exp() + self._rows[number]["bias"]
+        if not self._exposure:
+            return color
+        row = self._rows[number]
+        return color * row["log_gain"].exp().to(color.device) + row["bias"].to(color.device)
 
     def exposed_at(self, color: torch.Tensor, timestamp_s: float) -> torch.Tensor:
         """Colour under an exposure interpolated linearly in time between training views."""
@@ -49,8 +65,7 @@ class ViewParameters:
         """A tracked pose under the correction interpolated linearly in time between training views."""
         if not self._refine_poses:
             return cam_from_world
-        motion = self._motion(self._at("shift", timestamp_s), self._at("turn", timestamp_s))
-        return motion.to(cam_from_world) @ cam_from_world
+        return self._motion(self._at("shift", timestamp_s), self._at("turn", timestamp_s)) @ cam_from_world
 
     def _at(self, name: str, timestamp_s: float) -> torch.Tensor:
         order = np.argsort(self._timestamps_s, kind="stable")
@@ -78,7 +93,7 @@ class ViewParameters:
             pose = change @ self._world_from_cam[i]
             pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
             self._world_from_cam[i] = pose
-            self._cam_from_world[i] = torch.from_numpy(np.linalg.inv(pose)).to(self._cam_from_world[i])
+            self._cam_from_world[i] = torch.from_numpy(np.linalg.inv(pose))
 
     def _motion(self, shift: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """(4, 4) float64: the exponential of SE(3)."""
