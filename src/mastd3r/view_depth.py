@@ -127,5 +127,5 @@ def dynamics_input(
         upsampled(sigma, work.grid, *graph.size),
         own,
         work.semantic,
-        features,
+        features=features,
     )
