@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -125,3 +126,19 @@ def test_votes_prune_and_restore_points() -> None:
 def test_the_thing_is_there_to_be_found() -> None:
     """The scene that these tests stand on: the thing covers some of the image, the lens sees it."""
     assert 0.01 < frame(0, 3.0)[2].mean() < 0.2 and THING.size > 0 and CAMERA.width == W
+
+
+def test_what_the_mask_is_told_of_a_frame_holds_its_features(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mastd3r import view_depth
+
+    grid, p = (6, 8), 48
+    monkeypatch.setattr(view_depth, "carried", lambda *_: (np.ones(p), np.ones(p)))
+    block = SimpleNamespace(px=np.zeros((p, 2)), inv_depth=np.ones(p), cam_from_world=np.eye(4))
+    graph = SimpleNamespace(blocks=[block], camera=lambda: CAMERA, depth_info=lambda _: np.ones(p), size=(80, 60))
+    work = SimpleNamespace(
+        index=3, timestamp_s=0.1, gray=np.zeros((60, 80), np.uint8), px=np.zeros((p, 2)), grid=grid,
+        own_inv_depth=None, semantic=np.full((60, 80), 0.2, np.float32),
+    )  # fmt: skip
+    features = np.ones((15, 20, 11), np.float32)
+    told = view_depth.dynamics_input(graph, 0, np.eye(4), work, 1.0, features)  # type: ignore[arg-type]
+    assert told.features is features and told.color is None and told.semantic is work.semantic

@@ -150,7 +150,7 @@ def dynamics_input(
         upsampled(sigma, work.grid, *graph.size),
         own,
         work.semantic,
-        features,
+        features=features,
     )
 
 

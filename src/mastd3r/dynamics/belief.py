@@ -152,7 +152,7 @@ def held(carried: Array, fresh: Array, looks: Array | None, config: DynamicsConf
     """
     if looks is None:
         return carried, fresh
-    hold = np.clip(carried / HELD_LOG_ODDS, 0, 1) * np.clip(_resized(looks, carried) / HELD_LOG_ODDS, 0, 1)
+    hold = np.clip(carried / HELD_LOG_ODDS, 0, 1) * np.clip(_resized(looks, carried) / HELD_LOG_ODDS - 0.5, 0, 1)
     unforgotten = carried * (1 + hold * np.float32(1 / config.memory - 1))
     return unforgotten, np.maximum(fresh, 0) + (1 - hold) * np.minimum(fresh, 0)
 

@@ -96,7 +96,7 @@ class MotionTest:
         residual = left - self._pose_error(rigid, left, trust * static)
         wide = along_epipolar(cov, rigid.slope, depth[1])
         if self.config.use_doubt:
-            wide = wide * np.float32(doubt_of_fit(residual, wide, inside))
+            wide = wide * np.float32(max(1.0, doubt_of_fit(residual, wide, inside) / self.config.doubt_tolerance))
         ratio = motion_log_ratio(residual, wide, self.config) * trust
         covered = self._flow.warp(past.moving, rigid.target)
         ratio += inside * self._grey_values(small, stable, left, inside, noise, (1 - trust) * (1 - covered))
@@ -113,7 +113,8 @@ class MotionTest:
         still *= float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3)
         as_static = mismatch(cur, still, noise)
         if self.config.use_doubt:
-            noise = noise * max(1.0, float(np.median(as_static[inside > 0])) if inside.any() else 1.0)
+            typical = float(np.median(as_static[inside > 0])) if inside.any() else 1.0
+            noise = noise * max(1.0, typical / self.config.doubt_tolerance)
             as_static = mismatch(cur, still, noise)
         as_flow = mismatch(cur, self._flow.warp(still, self._flow.grid + left), noise)
         clash = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * open_to_doubt

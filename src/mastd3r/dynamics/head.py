@@ -21,7 +21,7 @@ Array = NDArray[Any]
 WAVES = 64  # random features beside the descriptors themselves
 SAMPLES = 400  # pixels that one frame teaches
 SURE_LOG_ODDS = 3.0  # evidence from which a pixel teaches with full weight
-STANDING_SHARE = 0.5  # how often a thing that can move is seen to stand: one such look says only so much
+STANDING_SHARE = 0.25  # how often a thing that can move is seen to stand: one such look says only so much
 PRIOR_INFO = 4.0  # of every weight, in pixels' worth
 FRAME_SHARE = 0.2  # pixels of a frame repeat one another: each counts for so much
 
