@@ -236,6 +236,28 @@ def host_system(
 
 
 @nb.njit(**_JIT)
+def host_columns(cross: Array, to_host: Array) -> Array:
+    """(p, 12 + 6 m) of one host: ``cross`` (m, p, 12) of its edges in the columns [pose i, pose j1 … jm, lens].
+
+    ``to_host`` (m, 6, 6): pose i's columns are those of pose j times it.
+    """
+    m, p = cross.shape[0], cross.shape[1]
+    out = np.zeros((p, 6 + 6 * m + N_GLOBAL))
+    last = 6 + 6 * m
+    for e in range(m):
+        for n in range(p):
+            for c in range(6):
+                v = cross[e, n, c]
+                if v != 0.0:
+                    out[n, 6 + 6 * e + c] = v
+                    for i in range(6):
+                        out[n, i] += v * to_host[e, c, i]
+            for c in range(N_GLOBAL):
+                out[n, last + c] += cross[e, n, 6 + c]
+    return out
+
+
+@nb.njit(**_JIT)
 def host_cost(
     px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
 ) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.gauss_newton import damped_solve
-from ..geometry.reprojection import N_COLS, N_GLOBAL, host_cost, host_system
+from ..geometry.reprojection import N_COLS, N_GLOBAL, host_columns, host_cost, host_system
 from ..geometry.se3 import adjoint, inverse, se3_exp
 
 Array = NDArray[Any]
@@ -177,22 +177,16 @@ def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
 
 def _host_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
     """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, lens]: J_i = -J_j Ad(j_from_i)."""
-    m = len(h)
-    n = 6 + 6 * m + N_GLOBAL
-    hess, rhs, cross = np.zeros((n, n)), np.zeros(n), np.zeros((e.shape[1], n), np.float64)
-    lens = slice(n - N_GLOBAL, n)
+    m, n = len(h), 6 + 6 * len(h) + N_GLOBAL
+    hess, rhs, to_local = np.zeros((n, n)), np.zeros(n), np.zeros((m, N_COLS, 6 + N_COLS))
+    to_local[:, :, 6:] = np.eye(N_COLS)
     for k in range(m):
-        to_local = np.zeros((N_COLS, 6 + N_COLS))
-        to_local[:6, :6] = -adjoint(j_from_i[k])
-        to_local[:, 6:] = np.eye(N_COLS)
-        part = to_local.T @ h[k] @ to_local
+        to_local[k, :6, :6] = -adjoint(j_from_i[k])
+        part = to_local[k].T @ h[k] @ to_local[k]
         at = np.r_[0:6, 6 + 6 * k : 12 + 6 * k, n - N_GLOBAL : n]
         hess[np.ix_(at, at)] += part
-        rhs[at] += to_local.T @ b[k]
-        cross[:, :6] += e[k, :, :6] @ to_local[:6, :6]
-        cross[:, 6 + 6 * k : 12 + 6 * k] = e[k, :, :6]
-        cross[:, lens] += e[k, :, 6:]
-    return hess, rhs, cross
+        rhs[at] += to_local[k].T @ b[k]
+    return hess, rhs, host_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 
 def _focal_sigma(hess: Array, lens: Lens) -> float:
