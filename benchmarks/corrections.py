@@ -94,6 +94,10 @@ def main() -> None:
                 key = f"{variant} {correction} {seed}"
                 if key in entries:
                     continue
+                same = entries.get(f"{VARIANTS[0]} {correction} {seed}")
+                if same is not None and "fine" not in correction:  # there the variants do not differ
+                    entries[key] = {**same, "variant": variant}
+                    continue
                 alignment = replace(base.alignment, as_printed=variant == "printed")
                 config = replace(base, correction=correction, alignment=alignment)
                 entries[key] = {"variant": variant, "correction": correction, "seed": seed}
