@@ -35,10 +35,10 @@ def close_loops(comparer: Comparer, graph: KeyframeGraph, places: PlaceIndex) ->
     Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised.
     """
     found: list[Loop] = []
-    ids = graph.members()
+    ids, joined = graph.members(), graph.connected_pairs()
     for j in ids:
         kf = graph.keyframes[j]
-        far = [i for i in ids if i < j - APART and not graph.connected(i, j) and not _known(found, i, j)]
+        far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
         for other in places.best(graph, kf.work, far, 2, MIN_LIKENESS):
             there = comparer.recognised(other, kf.work, Later.known(kf.moving / 255.0))
             back = comparer.recognised(kf, other.work, Later.known(other.moving / 255.0)) if _strong(there) else None
@@ -94,7 +94,7 @@ def widen(graph: KeyframeGraph, connect: Callable[[int, int], bool]) -> int:
     the chain together across them. At most ``WIDE_PAIRS`` a keyframe, those that share most first.
     """
     ids = graph.members()
-    done = {frozenset((e.i, e.j)) for e in graph.edges}
+    done = graph.connected_pairs()
     pairs = []
     poses = np.stack([graph.blocks[k].cam_from_world for k in ids])
     shared = {i: overlaps(graph, i, poses) for i in ids}

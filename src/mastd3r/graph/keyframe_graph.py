@@ -278,6 +278,10 @@ class KeyframeGraph:
         """True where matches of one in the other are edges."""
         return any({e.i, e.j} == {i, j} for e in self.edges)
 
+    def connected_pairs(self) -> set[frozenset[int]]:
+        """All pairs that are ``connected``, for those who ask about many."""
+        return {frozenset((e.i, e.j)) for e in self.edges}
+
     def edges_among(self, ids: Iterable[int]) -> list[Edge]:
         """Edges with both ends in ``ids``."""
         inside = set(ids)
