@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
+import cv2
 from numpy.typing import NDArray
 
 from ..config import SourceConfig
@@ -18,7 +18,8 @@ def frame_is_blank(image: NDArray[Any]) -> bool:
 
     The measure is the standard deviation of the grey image, below 2 of 255 levels.
     """
-    return float(np.asarray(image, np.float32).mean(-1).std()) < BLANK_STD
+    _, spread = cv2.meanStdDev(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    return float(spread[0, 0]) < BLANK_STD
 
 
 def check_window(config: SourceConfig) -> None:
