@@ -49,7 +49,9 @@ LAYERS: dict[str, set[str]] = {
     "finish": {"geometry", *CONTRACTS, *STAGES},
     "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare", "lookahead"},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "lookahead", "loops"},
-    "second_pass": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify"},
+    "second_pass": {
+        "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify", "lookahead",
+    },
     "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
     "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},
     "run": {

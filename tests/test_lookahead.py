@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -58,6 +59,14 @@ def test_values_are_made_in_order_and_errors_are_raised_at_get() -> None:
     assert Later.known(3).get() == 3
     with pytest.raises(ZeroDivisionError):
         broken.get()
+
+
+def test_leaving_waits_for_what_was_given() -> None:
+    made: list[int] = []
+    with pytest.raises(KeyError), Beside("test") as beside:
+        beside.later(lambda: (time.sleep(0.05), made.append(1)))
+        raise KeyError("here")
+    assert made == [1]
 
 
 @pytest.mark.parametrize("pairs_ahead", [False, True])

@@ -32,6 +32,13 @@ class Beside:
         """The value of ``make``, made there."""
         return Later(self._pool.submit(make).result)
 
+    def __enter__(self) -> Beside:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Waits for all that was given to it."""
+        self._pool.shutdown()
+
 
 def ahead(items: Iterator[T], work: Callable[[T, C], None], context: Callable[[], C]) -> Iterator[T]:
     """The items, in order; ``work`` is done on each, in one other thread, before it is given.

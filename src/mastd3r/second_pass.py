@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import cv2
@@ -21,6 +22,7 @@ from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.point_votes import PointVotes
 from .lens_view import LensView
+from .lookahead import Beside, Later, ahead
 from .parts import Parts
 from .rectify import Rectifier, tracked_frames
 from .types import Frame, View, WorkFrame
@@ -29,6 +31,7 @@ from .view_depth import dynamics_input, reprojection_residual_px, static_at
 Array = NDArray[Any]
 BLEEDING_PX = 5  # at half the working size: flow of a moving thing spills over its outline; u is taken back by that
 COMPARED = (-4, -2, -1, 1, 2, 4)  # keyframes that u(p) is found against, from the frame's own
+SHOWN_LATE = 4  # masks that may wait to be written
 RESIDUAL_MAX_PX = 8.0  # as uncertain as can be: one wild match must not make all others small in u = e / max e
 
 
@@ -92,29 +95,37 @@ def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask
     chosen = _view_positions(look.final, look.config)
     belief = TwoWayBelief(look.config.dynamics, *parts.size, look.head or OnlineHead(look.config.dynamics))
     uncoloured: list[int] = []  # keyframes without colours yet
-    for mask in belief.masks(_inputs(frames, look, chosen, waiting)):
-        one = waiting.popleft()
-        place = one.place
-        moving = _over_photograph(mask.probability, look.rectifier)
-        on_mask(SeenMask(place.record.timestamp_s, one.small, mask, moving))
-        if place.record.is_keyframe:
-            uncoloured.append(place.record.kf_id)
-        if is_holdout(one.position):
-            out.holdout.append(place)
-            continue
-        for kf_id in uncoloured:  # a holdout keyframe takes its colours from the frame after it
-            out.colors[kf_id], p, _ = _seen_by(one.small, mask.probability, graph, kf_id, place)
-            votes.start(kf_id, p, out.colors[kf_id])
-        uncoloured.clear()
-        kf_id = place.record.kf_id
-        if kf_id in out.colors and not place.record.is_keyframe:
-            colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
-            votes.add(kf_id, p, colors, inside)
-        if one.photograph is not None:
-            uncertainty = one.uncertainty
-            if uncertainty is not None:
-                uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
-            out.views.append(_view(one.photograph, place, moving, uncertainty, lens_view))
+    written = deque[Later[None]]()
+    inputs = ahead(_inputs(frames, look, chosen, waiting), lambda _, __: None, lambda: None)
+    with Beside("masks") as writer:
+        for mask in belief.masks(inputs):
+            one = waiting.popleft()
+            place = one.place
+            moving = _over_photograph(mask.probability, look.rectifier)
+            shown = SeenMask(place.record.timestamp_s, one.small, mask, moving)
+            written.append(writer.later(partial(on_mask, shown)))
+            if len(written) > SHOWN_LATE:
+                written.popleft().get()
+            if place.record.is_keyframe:
+                uncoloured.append(place.record.kf_id)
+            if is_holdout(one.position):
+                out.holdout.append(place)
+                continue
+            for kf_id in uncoloured:  # a holdout keyframe takes its colours from the frame after it
+                out.colors[kf_id], p, _ = _seen_by(one.small, mask.probability, graph, kf_id, place)
+                votes.start(kf_id, p, out.colors[kf_id])
+            uncoloured.clear()
+            kf_id = place.record.kf_id
+            if kf_id in out.colors and not place.record.is_keyframe:
+                colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
+                votes.add(kf_id, p, colors, inside)
+            if one.photograph is not None:
+                uncertainty = one.uncertainty
+                if uncertainty is not None:
+                    uncertainty = lens_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
+                out.views.append(_view(one.photograph, place, moving, uncertainty, lens_view))
+        while written:
+            written.popleft().get()
     out.moving = votes.moving()
     return out
 

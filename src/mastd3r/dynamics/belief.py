@@ -98,7 +98,8 @@ class DynamicBelief:
         gaps = sorted({min(g, len(self._past)) for g in self.config.gaps} - {0})
         if self.config.use_motion and gaps:
             static = 1 - sigmoid(carried)
-            found = self._test.compare(given, arrival.gray, arrival.texture, static, [self._past[-g] for g in gaps])
+            now = self._test.present(given, arrival.gray, arrival.texture)
+            found = self._test.compare([(now, static, self._past[-g]) for g in gaps])
             terms["motion"] = fresh = sum((c.log_ratio for c in found), fresh)
             if gaps[0] == 1:  # a better flow than the one prior() had
                 carried = self._carry(arrival.gray, found[0].flow, arrival.texture)

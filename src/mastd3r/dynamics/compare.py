@@ -42,6 +42,18 @@ class Past:
 
 
 @dataclass(frozen=True)
+class Present:
+    """What comparing needs of a frame whose pose and depths are known, at half the working size."""
+
+    gray: Array  # (h, w) uint8
+    world_from_cam: Array  # (4, 4)
+    inv_depth: Array  # (h, w) float32, no gaps
+    inv_depth_sigma: Array  # (h, w) float32
+    flow_cov: Array  # (h, w, 3) float32 of flow from this texture
+    photo_var: Array  # (h, w) float32 of grey values
+
+
+@dataclass(frozen=True)
 class Comparison:
     """A frame against one past frame."""
 
@@ -57,49 +69,38 @@ class MotionTest:
         self._flow = flow
         self._camera: Camera | None = None
         self._rays = np.zeros((3, height, width), np.float32)
-        self._others = ThreadPoolExecutor(max(len(config.gaps) - 1, 1), "mask")
+        self._two = ThreadPoolExecutor(2, "compare")
 
-    def compare(
-        self, given: DynamicsInput, small: Array, texture: Information, static: Array, past: Sequence[Past]
-    ) -> list[Comparison]:
-        """Log ratios against every given past frame. ``small`` (h, w) uint8, ``static`` (h, w) prior P(static)."""
-        inv_depth, sigma = self._background(given)
+    def present(self, given: DynamicsInput, small: Array, texture: Information) -> Present:
+        """What ``compare`` is to know of a frame; ``small`` is its (h, w) uint8 grey image."""
         self._lens(given.camera)
+        inv_depth, sigma = self._background(given)
         cov = flow_covariance(texture, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
-        noise = photo_variance(texture, self.config)
+        return Present(small, given.world_from_cam, inv_depth, sigma, cov, photo_variance(texture, self.config))
 
-        def one(earlier: Past) -> Comparison:
-            return self._one(given, small, static, earlier, (inv_depth, sigma), cov, noise)
+    def compare(self, pairs: Sequence[tuple[Present, Array, Past]]) -> list[Comparison]:
+        """Log ratios of each (frame, its prior P(static) (h, w), other frame), in order, on two threads."""
+        return list(self._two.map(lambda pair: self._one(*pair), pairs))
 
-        beside = [self._others.submit(one, p) for p in past[1:]]
-        return [*(one(p) for p in past[:1]), *(job.result() for job in beside)]
-
-    def _one(
-        self,
-        given: DynamicsInput,
-        small: Array,
-        static: Array,
-        past: Past,
-        depth: tuple[Array, Array],
-        cov: Array,
-        noise: Array,
-    ) -> Comparison:
+    def _one(self, frame: Present, static: Array, past: Past) -> Comparison:
         """The past image is first drawn as a rigid scene would show it now; only what is left is flow."""
         assert self._camera is not None
-        past_from_cur = inverse(past.world_from_cam) @ given.world_from_cam
-        rigid = rigid_flow(self._camera, self._rays, past_from_cur, depth[0])
+        small = frame.gray
+        past_from_cur = inverse(past.world_from_cam) @ frame.world_from_cam
+        rigid = rigid_flow(self._camera, self._rays, past_from_cur, frame.inv_depth)
         stable = self._flow.warp(past.gray, rigid.target)
         left = self._flow.between(small, stable)
         inside = self._inside(rigid)
         error = self._flow.round_trip_px(left, self._flow.quick(stable, small))
         trust = np.exp(-0.5 * (error / self.config.round_trip_px) ** 2) * inside
         residual = left - self._pose_error(rigid, left, trust * static)
-        wide = along_epipolar(cov, rigid.slope, depth[1])
+        wide = along_epipolar(frame.flow_cov, rigid.slope, frame.inv_depth_sigma)
         if self.config.use_doubt:
             wide = wide * np.float32(max(1.0, doubt_of_fit(residual, wide, inside) / self.config.doubt_tolerance))
         ratio = motion_log_ratio(residual, wide, self.config) * trust
         covered = self._flow.warp(past.moving, rigid.target)
-        ratio += inside * self._grey_values(small, stable, left, inside, noise, (1 - trust) * (1 - covered))
+        open_to_doubt = (1 - trust) * (1 - covered)
+        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, open_to_doubt)
         return Comparison(ratio.astype(np.float32), rigid.target - self._flow.grid + left)
 
     def _grey_values(
@@ -134,8 +135,8 @@ class MotionTest:
     def _lens(self, camera: Camera) -> None:
         small = camera.resized(self.width, self.height)
         if small != self._camera:
-            self._camera = small
             self._rays = np.moveaxis(small.rays(small.pixel_grid()), -1, 0).astype(np.float32)
+            self._camera = small
 
     def _inside(self, rigid: RigidFlow) -> Array:
         x, y = rigid.target[..., 0], rigid.target[..., 1]

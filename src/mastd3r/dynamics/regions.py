@@ -62,7 +62,7 @@ def region_mean(guide: Array, value: Array, weight: Array, radius_px: float, edg
     return both[..., 0] / np.maximum(both[..., 1], np.float32(1e-6))
 
 
-@numba.njit(cache=True, fastmath=False)
+@numba.njit(cache=True, fastmath=False, nogil=True)
 def _recursive_x(both: Array, pass_on: Array) -> None:
     h, w, n = both.shape
     for y in range(h):
@@ -76,7 +76,7 @@ def _recursive_x(both: Array, pass_on: Array) -> None:
                 both[y, x, k] += a * (both[y, x + 1, k] - both[y, x, k])
 
 
-@numba.njit(cache=True, fastmath=False)
+@numba.njit(cache=True, fastmath=False, nogil=True)
 def _recursive_y(both: Array, pass_on: Array) -> None:
     h, w, n = both.shape
     for y in range(1, h):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .belief import check_input, held, kept_share, shown_mask, with_depth, without_motion
-from .compare import Comparison, MotionTest, Past
+from .compare import MotionTest, Past, Present
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
 from .depth import depth_log_ratio
@@ -29,6 +29,7 @@ class _Seen:
 
     given: DynamicsInput
     past: Past  # with the belief of what came before it
+    present: Present | None  # None without the motion term
     texture: Information
     motion: Array  # (h, w) log ratios so far
     depth: Array | None  # (h, w) log ratio of its own depth
@@ -81,30 +82,33 @@ class TwoWayBelief:
         looks = None
         if self.config.use_head and given.features is not None and self.head is not None:
             looks = self.head.log_odds(given.features)
-        new = _Seen(given, Past(small, given.world_from_cam, self._nothing), texture, self._nothing, depth, looks)
+        present = self._test.present(given, small, texture) if self.config.use_motion else None
+        past = Past(small, given.world_from_cam, self._nothing)
+        new = _Seen(given, past, present, texture, self._nothing, depth, looks)
         before = list(self._window)
         gaps = sorted({min(g, len(before)) for g in self.config.second_gaps} - {0})
         if before:
             new.flow[-1] = self._flow.quick(small, before[-1].past.gray)
             new.kept[-1] = self._kept(new, before[-1], new.flow[-1])
             carried = self._carried(self._causal, new, -1)
-            if self.config.use_motion:
-                for gap in gaps:
-                    self._against(new, before[-gap], 1 - sigmoid(carried), -gap)
+            static = 1 - sigmoid(carried)
+            self._compare([(new, before[-gap], static, -gap) for gap in gaps])
         else:
             carried = self._nothing
         self._causal = self._added(carried, new)
         new.past = Past(small, given.world_from_cam, self._moving(new, self._causal))
         self._window.append(new)
-        if self.config.use_future and self.config.use_motion:
-            for gap in (g for g in gaps if g in self.config.second_gaps):
-                self._against(before[-gap], new, 1 - before[-gap].past.moving, gap)
+        if self.config.use_future:
+            earlier = [(before[-g], g) for g in gaps if g in self.config.second_gaps]
+            self._compare([(one, new, 1 - one.past.moving, gap) for one, gap in earlier])
 
-    def _against(self, one: _Seen, other: _Seen, static: Array, gap: int) -> None:
-        found: Comparison = self._test.compare(one.given, one.past.gray, one.texture, static, [other.past])[0]
-        one.motion = one.motion + found.log_ratio
-        if abs(gap) == 1:
-            one.flow[gap], one.kept[gap] = found.flow, self._kept(one, other, found.flow)
+    def _compare(self, pairs: list[tuple[_Seen, _Seen, Array, int]]) -> None:
+        """The motion term of each (frame, other frame, P(static) of the frame, frames between them)."""
+        told = [(one.present, static, other.past) for one, other, static, _ in pairs if one.present is not None]
+        for (one, other, _, gap), found in zip(pairs, self._test.compare(told), strict=False):
+            one.motion = one.motion + found.log_ratio
+            if abs(gap) == 1:
+                one.flow[gap], one.kept[gap] = found.flow, self._kept(one, other, found.flow)
 
     def _give_out(self) -> DynamicMask:
         """The mask of the oldest frame, which has seen all it will see."""

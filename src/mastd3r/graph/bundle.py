@@ -6,9 +6,10 @@ has 6 rows a keyframe and 6 for the lens.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from ..geometry.reprojection import N_COLS, N_GLOBAL, host_columns, host_cost, h
 from ..geometry.se3 import adjoint, inverse, se3_exp
 
 Array = NDArray[Any]
+T = TypeVar("T")
+_BESIDE = ThreadPoolExecutor(1, "hosts")
 
 
 @dataclass
@@ -145,29 +148,50 @@ def _linearise(
     hosts: dict[int, _Host] = {}
     total = _prior_cost(blocks, by_host, lens)
     lens_cols = np.where(lens.free, np.arange(size - N_GLOBAL, size), -1)
-    for i, edges in by_host.items():
-        block = blocks[i]
-        target, weight, j_from_i = _gather(blocks, edges)
-        h, b, e, hdd, bd, cost = host_system(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px)
-        total += float(cost.sum())
-        block.depth_info = hdd.sum(0)
-        hdd_i = block.depth_info + block.prior_info + 1e-9
-        bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
-        local_h, local_b, cross = _host_local(h, b, e, j_from_i)
-        columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
-        scaled = cross / hdd_i[:, None]
-        local_h -= scaled.T @ cross
-        local_b -= scaled.T @ bd_i
-        keep = columns >= 0
-        rows = columns[keep]
+
+    def one(i: int) -> tuple[_Host, Array, Array, float]:
+        return _reduced(blocks, by_host[i], lens, row_of, lens_cols, kernel_px)
+
+    for i, (host, local_h, local_b, cost) in zip(by_host, _on_two_threads(one, list(by_host)), strict=True):
+        total += cost
+        hosts[i] = host
+        keep = host.columns >= 0
+        rows = host.columns[keep]
         np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
         np.add.at(rhs, rows, local_b[keep])
-        hosts[i] = _Host(columns, cross, hdd_i, bd_i)
     free = np.flatnonzero(lens.free)
     rows = size - N_GLOBAL + free
     hess[rows, rows] += lens.prior_info[free]
     rhs[rows] += lens.prior_info[free] * (lens.prior[free] - lens.g[free])
     return hess, rhs, hosts, total
+
+
+def _reduced(
+    blocks: dict[int, Block], edges: list[Edge], lens: Lens, row_of: dict[int, int], lens_cols: Array, kernel_px: float
+) -> tuple[_Host, Array, Array, float]:
+    """One host with its depths eliminated: what back-substitution needs, its part of the system, its cost."""
+    i = edges[0].i
+    block = blocks[i]
+    target, weight, j_from_i = _gather(blocks, edges)
+    h, b, e, hdd, bd, cost = host_system(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px)
+    block.depth_info = hdd.sum(0)
+    hdd_i = block.depth_info + block.prior_info + 1e-9
+    bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
+    local_h, local_b, cross = _host_local(h, b, e, j_from_i)
+    columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
+    scaled = cross / hdd_i[:, None]
+    local_h -= scaled.T @ cross
+    local_b -= scaled.T @ bd_i
+    return _Host(columns, cross, hdd_i, bd_i), local_h, local_b, float(cost.sum())
+
+
+def _on_two_threads(make: Callable[[int], T], hosts: list[int]) -> list[T]:
+    """``make`` of every host, in order; every other one is made in a thread beside."""
+    beside = _BESIDE.submit(lambda: [make(i) for i in hosts[1::2]])
+    here = [make(i) for i in hosts[::2]]
+    out: list[Any] = [None] * len(hosts)
+    out[::2], out[1::2] = here, beside.result()
+    return out
 
 
 def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
@@ -229,9 +253,9 @@ def _prior_cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: 
 
 
 def _cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, kernel_px: float) -> float:
-    total = _prior_cost(blocks, by_host, lens)
-    for i, edges in by_host.items():
-        target, weight, j_from_i = _gather(blocks, edges)
+    def one(i: int) -> float:
+        target, weight, j_from_i = _gather(blocks, by_host[i])
         block = blocks[i]
-        total += float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
-    return total
+        return float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
+
+    return _prior_cost(blocks, by_host, lens) + sum(_on_two_threads(one, list(by_host)))
