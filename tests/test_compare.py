@@ -15,7 +15,8 @@ from mastd3r.lookahead import Later
 from mastd3r.parts import Parts
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
-from mastd3r.types import Guess
+from mastd3r.types import Frame, Guess
+from test_pointmap import pair_of
 from test_pointmap_mast3r import FULL, WORK, TrueNetwork, photograph, provider_of
 
 
@@ -25,7 +26,7 @@ class NoFeatures:
     def __init__(self, allowed: bool) -> None:
         self.allowed, self.asked = allowed, 0
 
-    def flow(self, ref: Any, new: Any) -> None:
+    def flow(self, ref: Any, new: Any, ref_moving: Any, new_moving: Any) -> None:
         assert self.allowed, "the network's own matches were not trusted"
         self.asked += 1
 
@@ -62,6 +63,39 @@ def test_without_a_network_features_start_the_flow() -> None:
     work = parts.observe(photograph(0.1))
     assert slam.comparer.recognised(slam.graph.keyframes[0], work, NOTHING_MOVES) is None
     assert isinstance(features, NoFeatures) and features.asked == 1
+
+
+def test_where_few_match_features_are_asked_and_the_better_start_is_kept() -> None:
+    """A jump of a quarter of the width: flow alone finds little, features find it, a wrong start is not taken."""
+    ref, new, _ = pair_of(np.eye(2), np.array([-80.0, 8.0]))
+    parts = Parts(GeometricPointmaps(320, 240, 10), (320, 240))
+    slam = Slam(Config(semantics="none"), parts, (320, 240))
+    slam.step(Frame(0, 0.0, np.dstack([ref] * 3)))
+    keyframe = slam.graph.keyframes[0]
+    still = Later.known(np.zeros((240, 320), np.float32))
+    matched = {}
+    for name, flow in (("none", None), ("true", np.float32([-80, 8])), ("wrong", np.float32([60, -60]))):
+        start = None if flow is None else np.tile(flow, (240, 320, 1))
+        parts.features = Given(start)  # type: ignore[assignment]
+        work = parts.observe(Frame(1, 0.1, np.dstack([new] * 3)))
+        nothing = np.zeros((240, 320, 2), np.float32)  # where a slow camera would be
+        matched[name] = slam.comparer.compare(keyframe, work, still, nothing, np.eye(4)).matched
+    assert parts.features.asked == 1  # type: ignore[attr-defined]
+    assert matched["none"] == matched["wrong"] < 0.3 * matched["true"]
+    work = parts.observe(Frame(1, 0.1, np.dstack([ref] * 3)))
+    slam.comparer.compare(keyframe, work, still, nothing, np.eye(4))
+    assert parts.features.asked == 1  # type: ignore[attr-defined] # enough matched: nothing else was tried
+
+
+class Given:
+    """Features that say what they are told."""
+
+    def __init__(self, flow: Any) -> None:
+        self.answer, self.asked = flow, 0
+
+    def flow(self, *_: Any) -> Any:
+        self.asked += 1
+        return self.answer
 
 
 def test_expected_pairs_are_decoded_once_in_both_orders() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from .types import Guess, Matches, PairPrediction, WorkFrame
 from .view_depth import static_at
 
 Array = NDArray[Any]
+THIN = 0.3  # share of a keyframe's static points that are matched, below: another start is tried
 
 
 @dataclass(frozen=True)
@@ -38,15 +39,22 @@ class Comparer:
     def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph) -> None:
         self.config, self.parts, self.graph = config, parts, graph
 
-    def compare(self, ref: Keyframe, new: WorkFrame, prior: Later[Array], flow: Array | None, guess: Array) -> TwoView:
-        """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new;
-        ``guess`` (4, 4) new_from_ref."""
+    def compare(
+        self, ref: Keyframe, new: WorkFrame, prior: Later[Array], flow: Array | None, guess: Array, near: bool = True
+    ) -> TwoView:
+        """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
+        ``near``: within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
         graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
         block = graph.blocks[ref.id]
         inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
-        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow)
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow, near and started)
         pair = self.parts.provider.predict(ref.work, new, known)  # III-A: both pointmaps, in ref's camera
         weight = pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)  # (5)(6), softly
+        if near and _thin(ref, weight) and (start := self._far_start(ref, new, prior)) is not None:
+            other = self.parts.provider.predict(ref.work, new, replace(known, flow=start, flow_is_near=False))
+            found = other.matches.weight * ref.static * static_at(prior.get(), other.matches.new_px)
+            if found.sum() > weight.sum():
+                pair, weight = other, found
         if started:
             info = graph.depth_info(ref.id)
             matches = StaticMatches(block.px, block.inv_depth, info, pair.matches.new_px, weight, graph.lens.g)
@@ -66,12 +74,23 @@ class Comparer:
 
         A provider that finds what is far needs no start; for the others corner features give one.
         """
-        far = self.parts.provider.finds_far
-        start = None if far else self.parts.features.flow(kf.work.gray, work.gray)
-        if start is None and not far:
+        start = self._far_start(kf, work, prior)
+        if start is None and not self.parts.provider.finds_far:
             return None
-        view = self.compare(kf, work, prior, start, np.eye(4))
+        view = self.compare(kf, work, prior, start, np.eye(4), near=False)
         return view if self.believed(view) else None
+
+    def _far_start(self, kf: Keyframe, work: WorkFrame, prior: Later[Array]) -> Array | None:
+        """Flow from corner features of the static scene; None where the provider needs none, or too few agree."""
+        if self.parts.provider.finds_far:
+            return None
+        return self.parts.features.flow(kf.work.gray, work.gray, kf.moving / 255.0, prior.get())
+
+
+def _thin(ref: Keyframe, weight: Array) -> bool:
+    """Few of the static points that could be matched were: perhaps the camera turned too fast for the start."""
+    usable = int((ref.work.texture * ref.static > 0.05).sum())
+    return int((weight > 0.05).sum()) < THIN * usable
 
 
 def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:

@@ -32,10 +32,13 @@ class FeatureStart:
         self._seen.move_to_end(key)
         return self._seen[key][1:]
 
-    def flow(self, ref: Array, new: Array) -> Array | None:
-        """(h, w, 2) float32 flow of the homography ref -> new; None where too few features agree."""
-        points_ref, described_ref = self._described(ref)
-        points_new, described_new = self._described(new)
+    def flow(self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None) -> Array | None:
+        """(h, w, 2) float32 flow of the homography ref -> new; None where too few features agree.
+
+        ``ref_moving``, ``new_moving`` (h, w): P(moving) in 0..1; what probably moves has no say.
+        """
+        points_ref, described_ref = _static(*self._described(ref), ref_moving)
+        points_new, described_new = _static(*self._described(new), new_moving)
         if described_ref is None or described_new is None:
             return None
         matches = self._matcher.match(described_ref, described_new)
@@ -51,3 +54,12 @@ class FeatureStart:
         grid = np.stack([x, y], -1)
         moved = cv2.perspectiveTransform(grid.reshape(-1, 1, 2), homography).reshape(h, w, 2)
         return np.clip(moved - grid, -2.0 * w, 2.0 * w).astype(np.float32)
+
+
+def _static(points: Any, described: Any, moving: Array | None) -> tuple[Any, Any]:
+    """The features that probably belong to the static scene; without descriptors where there are none."""
+    if described is None or moving is None:
+        return points, described
+    at = np.array([p.pt for p in points]).round().astype(int)
+    still = np.flatnonzero(moving[at[:, 1], at[:, 0]] < 0.5)
+    return [points[n] for n in still], described[still] if len(still) else None
