@@ -58,7 +58,9 @@ def loop_correction(path: Path) -> list[str]:
         f"{e['sequence']}, {e['keyframes']} keyframes bent by up to {100 * e['moved_m']:.0f} cm, map trained for "
         f"{e['iterations']} steps of {e['max_gaussians']:,} Gaussians, then every keyframe put right (simulated) "
         f"in {e['correction_s']:.1f} s. "
-        f"By `python benchmarks/loop_correction.py --data DATA --out {path.as_posix()}`, commit {e['git_commit']}."
+        f"By `python benchmarks/loop_correction.py --data DATA --out {path.as_posix()} --iterations {e['iterations']} "
+        f"--gaussians {e['max_gaussians']}`, commit {e['git_commit']}. Bound right after it: {e['bound_db']} dB below "
+        f"before, {'held' if e['holds'] else 'not held'}."
     )
     out += ["", "| holdout PSNR | dB |", "|---|---|", f"| before the correction | {e['before_db']:.2f} |"]
     out.append(f"| right after it | {e['after_db']:.2f} |")
