@@ -14,6 +14,7 @@ from ..errors import ConfigError, InputError
 from ..geometry.camera import Camera
 from ..types import StaticCloud, View
 from .adam import RowAdam
+from .correction import Sight, bend, changes_of, followed, sight
 from .densify import DensifyPolicy, DensifySettings
 from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
@@ -38,6 +39,8 @@ class TrainingRates:
 
 
 SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
+BEND_RATIO = 2e-3  # of the median depth, about half a pixel: corrections that bend less move Gaussians by their anchor
+MAX_SIGHTS = 48  # views that are drawn to see which keyframes a Gaussian follows
 
 
 class Mapper:
@@ -136,9 +139,29 @@ class Mapper:
             self._adam.grow(len(seeds))
 
     def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
-        """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts."""
-        self._map = self._map.moved(old_world_from_kf, new_world_from_kf)
+        """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts.
+
+        Where the correction bends the world, a Gaussian goes with all keyframes that see it (``correction.py``),
+        which costs a picture of some views; otherwise with its anchor alone.
+        """
+        changes = changes_of(old_world_from_kf, new_world_from_kf)
+        if not changes:
+            return
+        hung = [changes.get(v.kf_id, np.eye(4)) for v in self._views]
+        middle = self._map.means.detach().double().median(0).values.cpu().numpy()
+        if bend(hung, middle) > BEND_RATIO * self._depth:
+            self._map = followed(self._map, changes, self._sights())
+        else:
+            self._map = self._map.moved(old_world_from_kf, new_world_from_kf)
         self._view_parameters.move_keyframes(old_world_from_kf, new_world_from_kf)
+
+    def _sights(self) -> Iterator[Sight]:
+        """What a part of the views sees of the map now."""
+        for number in np.unique(np.linspace(0, len(self._views) - 1, MAX_SIGHTS).round().astype(int)):
+            view, (_, weight) = self._views[number], self._target(int(number))
+            K = torch.from_numpy(view.camera.matrix).to(self._device)
+            pose = self._view_parameters.cam_from_world(int(number))
+            yield sight(self._map, view.kf_id, pose, K, weight, self._near)
 
     def _draw(
         self,

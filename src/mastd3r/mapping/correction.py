@@ -1,0 +1,118 @@
+"""A graph correction that bends the world: a Gaussian follows all keyframes that see it, not its anchor alone.
+
+Training has put a Gaussian where the views that see it agree best. Where those hang on keyframes that had drifted
+apart, that is between them; so its motion is theirs, averaged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from .gaussians import Array, GaussianMap, quaternion_from_rotation, quaternion_product
+
+RAY_SHARE = 0.2  # what a view says of depth, as a share of what it says across its ray
+ANCHOR_PX = 1.0  # the anchor counts as a view in which the Gaussian covers this many pixels
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How much of one view's picture each Gaussian makes up."""
+
+    kf_id: int  # keyframe that the view hangs on
+    centre: Array  # (3,) of the camera, before the correction
+    weight_px: torch.Tensor  # (n,) sum of blending weights over the pixels
+
+
+def changes_of(old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> dict[int, Array]:
+    """(4, 4) of each keyframe in both dicts: its new pose over its old one, new_world_from_old_world."""
+    both = sorted(set(old_world_from_kf) & set(new_world_from_kf))
+    return {
+        kf: np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(np.asarray(old_world_from_kf[kf], float))
+        for kf in both
+    }
+
+
+def bend(changes: Iterable[Array], point: Array) -> float:
+    """How far apart the changes would put one point: the largest distance from the mean. 0 for a rigid correction."""
+    moved = np.stack([c[:3, :3] @ point + c[:3, 3] for c in changes])
+    return float(np.linalg.norm(moved - moved.mean(0), axis=1).max())
+
+
+def sight(
+    gaussians: GaussianMap,
+    kf_id: int,
+    cam_from_world: torch.Tensor,
+    intrinsics: torch.Tensor,
+    pixel_weight: torch.Tensor,
+    near: float,
+) -> Sight:
+    """What one view (h, w) sees of the map; ``pixel_weight`` is what the pixels count in training.
+
+    A picture is linear in the colours: its gradient in a colour is the weight of that Gaussian.
+    """
+    colors = torch.zeros_like(gaussians.colors).requires_grad_()
+    plain = replace(gaussians, colors=colors, sh_rest=gaussians.sh_rest[:, :0])
+    height, width = pixel_weight.shape
+    color, _, _ = plain.draw(cam_from_world.detach(), intrinsics, width, height, near)
+    (weight_px,) = torch.autograd.grad((color[..., 0] * pixel_weight).sum(), colors)
+    centre = np.linalg.inv(cam_from_world.detach().cpu().numpy())[:3, 3]
+    return Sight(kf_id, centre, weight_px[:, 0].detach())
+
+
+def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable[Sight]) -> GaussianMap:
+    """The map after a correction, each Gaussian moved by the mean of what its sights' keyframes do.
+
+    Its centre: least squares over the views, where a view counts by its pixels, and along its ray only by
+    ``RAY_SHARE``, because it hardly tells depth. Its turn and its scale: the mean by pixels. What no view sees moves
+    with its anchor, and so do harmonics. Where all changes are equal, so is the motion. Keyframes without a change
+    stand still.
+    """
+    identity = {int(kf): np.eye(4) for kf in gaussians.kf_id.unique().cpu().numpy()}
+    anchored = gaussians.moved(identity, changes)
+    before, device = gaussians.means.detach().double(), gaussians.means.device
+    eye = torch.eye(3, dtype=torch.float64, device=device)
+    anchor_turn, anchor_scale = _anchor_motion(gaussians, changes)
+    total = ANCHOR_PX * eye.expand(len(before), 3, 3)
+    shift = ANCHOR_PX * (anchored.means.detach().double() - before)
+    turn, log_scale = ANCHOR_PX * anchor_turn, ANCHOR_PX * anchor_scale
+    pixels = torch.full((len(before),), ANCHOR_PX, dtype=torch.float64, device=device)
+    for seen in sights:
+        change, weight = changes.get(seen.kf_id, np.eye(4)), seen.weight_px.double()
+        linear, offset, centre = (
+            torch.from_numpy(np.array(a, float)).to(device) for a in (change[:3, :3], change[:3, 3], seen.centre)
+        )
+        ray = torch.nn.functional.normalize(before - centre, dim=1)
+        across = (1 + RAY_SHARE) * eye - ray[:, :, None] * ray[:, None, :]
+        information = weight[:, None, None] * across
+        motion = before @ linear.T + offset - before
+        total = total + information
+        shift = shift + (information @ motion[..., None])[..., 0]
+        quaternion, scale = _turn_and_scale(change)
+        step = torch.from_numpy(quaternion).to(device)
+        step = step * torch.where((anchor_turn @ step) < 0, -1.0, 1.0)[:, None]
+        turn, log_scale, pixels = turn + weight[:, None] * step, log_scale + weight * scale, pixels + weight
+    means = before + torch.linalg.solve(total, shift)
+    turn = torch.nn.functional.normalize(turn, dim=1)
+    quats = quaternion_product(turn, gaussians.quats.detach().double())
+    log_scales = gaussians.log_scales.detach() + (log_scale / pixels)[:, None].to(gaussians.log_scales)
+    leaves = {"means": means.to(gaussians.means), "quats": quats.to(gaussians.quats), "log_scales": log_scales}
+    return replace(anchored, **{name: tensor.requires_grad_() for name, tensor in leaves.items()})
+
+
+def _turn_and_scale(change: Array) -> tuple[Array, float]:
+    """(4,) wxyz and the logarithm of the scale of a similarity."""
+    scale = float(np.cbrt(np.linalg.det(change[:3, :3])))
+    return quaternion_from_rotation(change[:3, :3] / scale), float(np.log(scale))
+
+
+def _anchor_motion(gaussians: GaussianMap, changes: dict[int, Array]) -> tuple[torch.Tensor, torch.Tensor]:
+    """(n, 4) turn and (n,) logarithm of the scale of every Gaussian's anchor."""
+    found, row = np.unique(gaussians.kf_id.cpu().numpy(), return_inverse=True)
+    motions = [_turn_and_scale(changes.get(int(kf), np.eye(4))) for kf in found]
+    turns, scales = np.stack([m[0] for m in motions])[row], np.array([m[1] for m in motions])[row]
+    device = gaussians.means.device
+    return torch.from_numpy(turns).to(device), torch.from_numpy(scales).to(device)

@@ -1,0 +1,118 @@
+"""A graph correction that bends the world, on random Gaussians: who follows whom."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from mastd3r.mapping.correction import Sight, bend, changes_of, followed, sight
+from mastd3r.mapping.gaussians import GaussianMap, quaternion_product
+from mastd3r.mapping.seed import seed_gaussians
+from mastd3r.types import StaticCloud
+
+K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)
+CENTRES = {0: (-0.5, 0.0, 0.0), 1: (0.0, 0.1, 0.0), 2: (0.5, 0.0, 0.1)}
+
+
+def random_map(count: int = 200) -> GaussianMap:
+    """Gaussians of all shapes; the first third anchored to keyframe 0, and so on."""
+    rng = np.random.default_rng(0)
+    cloud = StaticCloud(
+        points_world=rng.uniform([-1, -1, 2], [1, 1, 4], (count, 3)).astype(np.float32),
+        colors=rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        confidence=np.ones(count, np.float32),
+        spacing=rng.uniform(0.02, 0.1, count).astype(np.float32),
+        kf_id=(np.arange(count) * 3 // count).astype(np.int32),
+    )
+    gaussians = seed_gaussians(cloud, count, 0)
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        gaussians.quats += torch.randn(count, 4, generator=generator)
+        gaussians.log_scales += 0.5 * torch.randn(count, 3, generator=generator)
+        gaussians.opacity_logits += torch.randn(count, generator=generator)
+    return gaussians
+
+
+def motion(turn: tuple[float, float, float], shift: tuple[float, float, float], scale: float = 1.0) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = scale * Rotation.from_rotvec(turn).as_matrix(), shift
+    return matrix
+
+
+def camera(kf: int) -> torch.Tensor:
+    return torch.from_numpy(np.linalg.inv(motion((0, 0.1 * (1 - kf), 0), CENTRES[kf])))
+
+
+def sights(gaussians: GaussianMap) -> list[Sight]:
+    return [sight(gaussians, kf, camera(kf), K, torch.ones(48, 64), 0.1) for kf in CENTRES]
+
+
+def test_weights_of_a_sight_are_shares_of_the_picture() -> None:
+    """Weighted colours sum to the sum of the picture; pixels that do not count add nothing."""
+    gaussians = random_map()
+    color, _, alpha = gaussians.draw(camera(0), K, 64, 48, 0.1)
+    seen = sight(gaussians, 0, camera(0), K, torch.ones(48, 64), 0.1)
+    assert torch.allclose(seen.weight_px @ gaussians.colors, color.sum((0, 1)), rtol=1e-4)
+    assert float(seen.weight_px.sum()) == pytest.approx(float(alpha.detach().sum()), rel=1e-4)
+    assert np.allclose(seen.centre, CENTRES[0])
+    assert torch.all(sight(gaussians, 0, camera(0), K, torch.zeros(48, 64), 0.1).weight_px == 0)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.3])
+def test_a_rigid_correction_is_followed_exactly(scale: float) -> None:
+    """All keyframes move alike: whatever the sights say, the map moves as by its anchors."""
+    gaussians, change = random_map(), motion((0.2, -0.7, 2.4), (0.3, -2, 1), scale)
+    changes = dict.fromkeys(CENTRES, change)
+    by_anchor = gaussians.moved(dict.fromkeys(CENTRES, np.eye(4)), changes)
+    by_sight = followed(gaussians, changes, sights(gaussians))
+    assert torch.allclose(by_sight.means, by_anchor.means, atol=1e-5)
+    assert torch.allclose(by_sight.log_scales, by_anchor.log_scales, atol=1e-5)
+    unit = [torch.nn.functional.normalize(m.quats, dim=1) for m in (by_sight, by_anchor)]
+    assert torch.all((unit[0] * unit[1]).sum(1).abs() > 1 - 1e-6)
+
+
+def test_what_one_keyframe_sees_follows_it_and_what_none_sees_its_anchor() -> None:
+    gaussians = random_map()
+    changes = {0: motion((0, 0, 0), (0.05, 0, 0)), 1: motion((0, 0, 0), (0, 0.05, 0))}  # 2 stands still
+    weight_px = torch.where(torch.arange(200) % 2 == 0, 1e6, 0.0)
+    after = followed(gaussians, changes, [Sight(1, np.zeros(3), weight_px)])
+    shift = (after.means - gaussians.means).detach()
+    assert torch.allclose(shift[::2], torch.tensor([0, 0.05, 0]), atol=1e-5)
+    unseen = torch.tensor([[0.05, 0, 0], [0, 0.05, 0], [0, 0, 0]])[gaussians.kf_id.long()]
+    assert torch.allclose(shift[1::2], unseen[1::2], atol=1e-6)
+
+
+def test_a_gaussian_stays_between_the_keyframes_that_see_it() -> None:
+    """Two views from one place, one moves aside and the other does not: half way, in any direction but turned too."""
+    gaussians = random_map()
+    changes, seen = {0: motion((0, 0, 0.2), (0, 0, 0))}, torch.full((200,), 1e6)
+    after = followed(gaussians, changes, [Sight(0, np.zeros(3), seen), Sight(1, np.zeros(3), seen)])
+    turned = motion((0, 0, 0.2), (0, 0, 0))[:3, :3]
+    before = gaussians.means.detach().double().numpy()
+    assert np.allclose(after.means.detach().numpy(), (before + before @ turned.T) / 2, atol=1e-5)
+    half = torch.from_numpy(Rotation.from_rotvec([0, 0, 0.1]).as_quat()[[3, 0, 1, 2]])
+    turns = followed(gaussians.picked(torch.arange(1)), changes, [Sight(k, np.zeros(3), seen[:1]) for k in (0, 1)])
+    expected = quaternion_product(half, gaussians.quats[:1].detach().double())
+    cosine = torch.nn.functional.cosine_similarity(turns.quats.detach().double(), expected)
+    assert float(cosine[0].abs()) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_view_along_the_motion_says_little_of_it() -> None:
+    """One keyframe moves along its ray, the other, which looks from the side, stands still: so does the Gaussian."""
+    gaussians = random_map(3)
+    with torch.no_grad():
+        gaussians.means[:] = torch.tensor([0.0, 0, 3])
+    changes, seen = {0: motion((0, 0, 0), (0, 0, 0.1))}, torch.full((3,), 1e6)
+    side = Sight(1, np.array([3.0, 0, 3]), seen)
+    after = followed(gaussians, changes, [Sight(0, np.zeros(3), seen), side])
+    assert torch.all((after.means - gaussians.means)[:, 2] < 0.02)
+
+
+def test_bend_is_nothing_for_a_rigid_correction_and_the_distance_otherwise() -> None:
+    turned = motion((0.2, 0, 1), (1, 2, 3))
+    assert bend([turned] * 4, np.array([1.0, 2, 3])) < 1e-12
+    assert bend([np.eye(4), motion((0, 0, 0), (0.1, 0, 0))], np.ones(3)) == pytest.approx(0.05)
+    old, new = {0: motion((0, 0, 1), (1, 0, 0)), 5: np.eye(4)}, {0: turned, 6: np.eye(4)}
+    assert list(changes_of(old, new)) == [0] and np.allclose(changes_of(old, new)[0] @ old[0], turned)
