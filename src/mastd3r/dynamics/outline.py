@@ -67,9 +67,23 @@ class Outline:
             base = np.log(self.config.base_rate) - np.log1p(-self.config.base_rate)
             return np.full((self.height, self.width), base, np.float32)
         self.check(semantic, "semantic")
-        floor = self.config.semantic_floor
-        p = np.clip(semantic, floor, 1 - floor).astype(np.float32)
+        floor, missed = self.config.semantic_floor, self.config.semantic_missed
+        least: Array | float = floor
+        if missed > floor:
+            seen = self._near(semantic)
+            least = seen * np.float32(floor) + (1 - seen) * np.float32(missed)
+        p = np.clip(semantic, least, 1 - floor).astype(np.float32)
         return (self.config.semantic_gain * np.log(p / (1 - p))).astype(np.float32)
+
+    def _near(self, semantic: Array) -> Array:
+        """(h, w) float32 the surest that the map is of anything within ``semantic_reach``, smoothly."""
+        reach = max(1, round(self.config.semantic_reach * self.width / 4))
+        small = cv2.resize(semantic, (self.w // 2, self.h // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+        most = cv2.dilate(small, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        near: Array = cv2.resize(
+            cv2.blur(most, (reach, reach)), (self.width, self.height), interpolation=cv2.INTER_LINEAR
+        )
+        return near
 
     def shrink(self, image: Array) -> Array:
         """A full-size image at half size."""
