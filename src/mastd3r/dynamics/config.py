@@ -29,7 +29,7 @@ class DynamicsConfig:
     semantic_gain: float = 0.8  # weight of the map's log-odds
     semantic_share: float = 0.3  # weight of our evidence where there is a map: it repeats from frame to frame
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
-    semantic_missed: float = 0.2  # nor below this far from what they show: a network has no class for every thing
+    semantic_missed: float = 0.25  # nor below this far from what they show: a network has no class for every thing
     semantic_reach: float = 0.05  # share of the image's width that counts as near
     gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with while tracking
     second_gaps: tuple[int, ...] = (1, 4, 12)  # frames back and forth, in the second pass; the last is its delay
@@ -57,6 +57,7 @@ class DynamicsConfig:
     chroma_gain: float = 1.5  # a step of colour against one of grey, for outlines
     fine_px: float = 8.0  # reach of the last step at full size, where there is colour
     fine_contrast: float = 12.0  # grey levels that are as far as fine_px
+    map_contrast: float = 20.0  # the same once a semantic map is joined, whose own outlines are coarse
     edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
     edge_contrast: float = 20.0  # grey levels that it takes for an edge
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth

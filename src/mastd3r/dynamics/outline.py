@@ -32,7 +32,8 @@ class Outline:
             belief = np.clip(belief, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(belief, given, sharp)
         if semantic is not None and c.use_semantic:
-            shown = c.semantic_share * shown
+            shown = c.semantic_share * shown + self.semantic_log_odds(semantic)
+            return sigmoid(self._fine(shown, given, c.map_contrast) if c.use_regions else shown)
         return sigmoid(shown + self.semantic_log_odds(semantic))
 
     def regions(self, belief: Array, given: DynamicsInput, sharp: Array | None) -> Array:
@@ -52,14 +53,19 @@ class Outline:
         pooled = region_mean(edges, belief, weight, c.region_px, c.region_contrast)
         a, b = guided_coefficients(guide, pooled, np.ones_like(pooled), c.edge_px, c.edge_contrast)
         full = self.full(a) * given.gray + self.full(b)
-        if given.color is not None:
-            size = (self.width, self.height)
-            fine = cv2.merge([given.gray.astype(np.float32), *_chroma(given.color, size, c.chroma_gain)])
-            full = region_mean(fine, full, np.ones_like(full), c.fine_px, c.fine_contrast)
+        full = self._fine(full, given, c.fine_contrast)
         if sharp is not None:
             alone = self.full(np.minimum(np.abs(sharp) / 2, 1))
             full = alone * self.full(belief) + (1 - alone) * full
         return np.clip(full, -c.max_log_odds, c.max_log_odds).astype(np.float32)
+
+    def _fine(self, full: Array, given: DynamicsInput, contrast: float) -> Array:
+        """Log-odds (h, w) brought to the photograph's own edges of colour; as they are where there is no colour."""
+        if given.color is None:
+            return full
+        c, size = self.config, (self.width, self.height)
+        fine = cv2.merge([given.gray.astype(np.float32), *_chroma(given.color, size, c.chroma_gain)])
+        return region_mean(fine, full, np.ones_like(full), c.fine_px, contrast)
 
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""

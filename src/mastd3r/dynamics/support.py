@@ -50,5 +50,5 @@ def leap_to_border(inv_depth: Array, sigma: Array) -> Array:
         if np.array_equal(reached, level):
             break
         level = reached
-    leap: Array = np.log(inv) - spread - level
-    return leap.astype(np.float32)
+    leap: Array = cv2.erode((np.log(inv) - spread - level).astype(np.float32), around)  # cells at an outline are mixed
+    return leap
