@@ -43,11 +43,12 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without time": ("use_time=false",),
     "without looks (head)": ("use_head=false",),
     "without frames after": ("use_future=false",),
+    "without support": ("use_support=false",),
     "without regions": ("use_regions=false",),
     "the tracking's gaps only": ("second_gaps=[1, 4]",),
     "paper, eq. (1)-(4)": ("variant=paper",),
 }
-PERFECT = ("semantic_share=0.0", "semantic_gain=1.0", "semantic_floor=0.001", "use_head=false")
+PERFECT = ("semantic_share=0.0", "semantic_gain=1.0", "semantic_floor=0.001", "semantic_missed=0.001", "use_head=false")
 STARTS = range(5)
 
 

@@ -16,6 +16,7 @@ class DynamicsConfig:
     base_rate: float = 0.1  # P(moving) where nothing is known
     use_depth: bool = True  # (a) the frame's own depth against the map's prediction
     use_motion: bool = True  # (b) flow and grey values against the rigid scene of pose and depth
+    use_support: bool = True  # second pass: a near depth that nothing holds is the mark of something that moves
     use_semantic: bool = True  # (c) P(movable) of the frame
     use_time: bool = True  # (d) the last belief, carried along the flow
     use_head: bool = True  # (e) looks of what moved in this video, learned online
@@ -28,6 +29,8 @@ class DynamicsConfig:
     semantic_gain: float = 0.8  # weight of the map's log-odds
     semantic_share: float = 0.3  # weight of our evidence where there is a map: it repeats from frame to frame
     semantic_floor: float = 0.02  # maps are never believed beyond floor and 1 - floor
+    semantic_missed: float = 0.25  # nor below this far from what they show: a network has no class for every thing
+    semantic_reach: float = 0.05  # share of the image's width that counts as near
     gaps: tuple[int, ...] = (1, 4)  # frames back that the frame is compared with while tracking
     second_gaps: tuple[int, ...] = (1, 4, 12)  # frames back and forth, in the second pass; the last is its delay
     head_share: float = 0.5  # weight of the head's log-odds
@@ -46,6 +49,7 @@ class DynamicsConfig:
     clash_gain: float = 1.5  # weight of grey values that nothing explains
     carry_mismatch: float = 10.0  # normalised grey mismatch from which the carried belief fades
     depth_noise_ratio: float = 0.03  # noise of the frame's own depth, as a share of it
+    floating_gain: float = 2.0  # weight of a depth that nothing holds
     region_px: float = 20.0  # reach of the pooling where there is no edge
     region_contrast: float = 15.0  # grey levels that are as far as region_px
     semantic_contrast: float = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
@@ -53,8 +57,9 @@ class DynamicsConfig:
     chroma_gain: float = 1.5  # a step of colour against one of grey, for outlines
     fine_px: float = 8.0  # reach of the last step at full size, where there is colour
     fine_contrast: float = 12.0  # grey levels that are as far as fine_px
+    map_contrast: float = 20.0  # the same once a semantic map is joined, whose own outlines are coarse
     edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
-    edge_contrast: float = 30.0  # grey levels that it takes for an edge
+    edge_contrast: float = 20.0  # grey levels that it takes for an edge
     tau_variance: float = 0.01  # eq. (1) tau_var: local variance of log depth
     tau_sigma: float = 2.5  # eq. (1) k
     window_px: int = 9  # eq. (1) window of the local variance

@@ -32,7 +32,8 @@ class Outline:
             belief = np.clip(belief, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(belief, given, sharp)
         if semantic is not None and c.use_semantic:
-            shown = c.semantic_share * shown
+            shown = c.semantic_share * shown + self.semantic_log_odds(semantic)
+            return sigmoid(self._fine(shown, given, c.map_contrast) if c.use_regions else shown)
         return sigmoid(shown + self.semantic_log_odds(semantic))
 
     def regions(self, belief: Array, given: DynamicsInput, sharp: Array | None) -> Array:
@@ -52,14 +53,19 @@ class Outline:
         pooled = region_mean(edges, belief, weight, c.region_px, c.region_contrast)
         a, b = guided_coefficients(guide, pooled, np.ones_like(pooled), c.edge_px, c.edge_contrast)
         full = self.full(a) * given.gray + self.full(b)
-        if given.color is not None:
-            size = (self.width, self.height)
-            fine = cv2.merge([given.gray.astype(np.float32), *_chroma(given.color, size, c.chroma_gain)])
-            full = region_mean(fine, full, np.ones_like(full), c.fine_px, c.fine_contrast)
+        full = self._fine(full, given, c.fine_contrast)
         if sharp is not None:
             alone = self.full(np.minimum(np.abs(sharp) / 2, 1))
             full = alone * self.full(belief) + (1 - alone) * full
         return np.clip(full, -c.max_log_odds, c.max_log_odds).astype(np.float32)
+
+    def _fine(self, full: Array, given: DynamicsInput, contrast: float) -> Array:
+        """Log-odds (h, w) brought to the photograph's own edges of colour; as they are where there is no colour."""
+        if given.color is None:
+            return full
+        c, size = self.config, (self.width, self.height)
+        fine = cv2.merge([given.gray.astype(np.float32), *_chroma(given.color, size, c.chroma_gain)])
+        return region_mean(fine, full, np.ones_like(full), c.fine_px, contrast)
 
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""
@@ -67,9 +73,23 @@ class Outline:
             base = np.log(self.config.base_rate) - np.log1p(-self.config.base_rate)
             return np.full((self.height, self.width), base, np.float32)
         self.check(semantic, "semantic")
-        floor = self.config.semantic_floor
-        p = np.clip(semantic, floor, 1 - floor).astype(np.float32)
+        floor, missed = self.config.semantic_floor, self.config.semantic_missed
+        least: Array | float = floor
+        if missed > floor:
+            seen = self._near(semantic)
+            least = seen * np.float32(floor) + (1 - seen) * np.float32(missed)
+        p = np.clip(semantic, least, 1 - floor).astype(np.float32)
         return (self.config.semantic_gain * np.log(p / (1 - p))).astype(np.float32)
+
+    def _near(self, semantic: Array) -> Array:
+        """(h, w) float32 the surest that the map is of anything within ``semantic_reach``, smoothly."""
+        reach = max(1, round(self.config.semantic_reach * self.width / 4))
+        small = cv2.resize(semantic, (self.w // 2, self.h // 2), interpolation=cv2.INTER_AREA).astype(np.float32)
+        most = cv2.dilate(small, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+        near: Array = cv2.resize(
+            cv2.blur(most, (reach, reach)), (self.width, self.height), interpolation=cv2.INTER_LINEAR
+        )
+        return near
 
     def shrink(self, image: Array) -> Array:
         """A full-size image at half size."""

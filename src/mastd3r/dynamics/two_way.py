@@ -19,6 +19,7 @@ from .flow import HalfFlow
 from .head import OnlineHead
 from .motion import Information, texture_information
 from .outline import Outline, sigmoid
+from .support import floating_log_ratio
 
 Array = NDArray[Any]
 
@@ -34,12 +35,14 @@ class _Seen:
     motion: Array  # (h, w) log ratios so far
     depth: Array | None  # (h, w) log ratio of its own depth
     looks: Array | None  # (h', w') log-odds of the head
+    floating: Array | None = None  # (h, w) log ratio of a depth that nothing holds
     flow: dict[int, Array] = field(default_factory=dict)  # -1: to the frame before, 1: to the frame after
     kept: dict[int, Array] = field(default_factory=dict)  # share of a belief that survives that way
 
     def fresh(self) -> Array:
         """Log ratios of this frame's own comparisons."""
-        return self.motion if self.depth is None else with_depth(self.motion, self.depth)
+        fresh = self.motion if self.floating is None else with_depth(self.motion, self.floating)
+        return fresh if self.depth is None else with_depth(fresh, self.depth)
 
 
 class TwoWayBelief:
@@ -85,6 +88,8 @@ class TwoWayBelief:
         present = self._test.present(given, small, texture) if self.config.use_motion else None
         past = Past(small, given.world_from_cam, self._nothing)
         new = _Seen(given, past, present, texture, self._nothing, depth, looks)
+        if self.config.use_support:
+            new.floating = self.outline.shrink(floating_log_ratio(given, self.config))
         before = list(self._window)
         gaps = sorted({min(g, len(before)) for g in self.config.second_gaps} - {0})
         if before:
@@ -120,6 +125,8 @@ class TwoWayBelief:
         terms = {"motion": seen.motion, "time": (before + after).astype(np.float32)}
         if seen.depth is not None:
             terms["depth"] = seen.depth
+        if seen.floating is not None:
+            terms["support"] = seen.floating
         features, looks = seen.given.features, seen.looks
         if config.use_head and features is not None and self.head is not None:
             self.head.learn(features, belief)
