@@ -47,11 +47,11 @@ class Comparer:
         graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
         block = graph.blocks[ref.id]
         inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
-        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow, near and started)
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow)
         pair = self.parts.provider.predict(ref.work, new, known)  # III-A: both pointmaps, in ref's camera
         weight = pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)  # (5)(6), softly
-        if near and _thin(ref, weight) and (start := self._far_start(ref, new, prior)) is not None:
-            other = self.parts.provider.predict(ref.work, new, replace(known, flow=start, flow_is_near=False))
+        if near and thin(ref, weight) and (start := self._far_start(ref, new, prior)) is not None:
+            other = self.parts.provider.predict(ref.work, new, replace(known, flow=start))
             found = other.matches.weight * ref.static * static_at(prior.get(), other.matches.new_px)
             if found.sum() > weight.sum():
                 pair, weight = other, found
@@ -87,8 +87,8 @@ class Comparer:
         return self.parts.features.flow(kf.work.gray, work.gray, kf.moving / 255.0, prior.get())
 
 
-def _thin(ref: Keyframe, weight: Array) -> bool:
-    """Few of the static points that could be matched were: perhaps the camera turned too fast for the start."""
+def thin(ref: Keyframe, weight: Array) -> bool:
+    """Few of the static points that could be matched were, (p,) ``weight``: a fast turn, or someone in front."""
     usable = int((ref.work.texture * ref.static > 0.05).sum())
     return int((weight > 0.05).sum()) < THIN * usable
 

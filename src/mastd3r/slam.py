@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .compare import Comparer, TwoView
+from .compare import Comparer, TwoView, thin
 from .config import Config
 from .dynamics.belief import DynamicBelief
 from .geometry.se3 import inverse
@@ -120,7 +120,24 @@ class Slam:
             if view is not None:
                 return view
         view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
-        return view if self.comparer.believed(view) else None
+        if not self.comparer.believed(view):
+            return None
+        return self._from_nearer(work, prior, view) if thin(self._ref, view.weight) else view
+
+    def _from_nearer(self, work: WorkFrame, prior: Later[Array], view: TwoView) -> TwoView:
+        """Few matches are left: the last good frame becomes a keyframe, so that the chain has no weak link."""
+        before, last = self._ref, self._last
+        if before is None or last is None or not self._last_can_be_keyframe():
+            return view
+        most, kf = self._most_matched, self._promote_last(*last)
+        near = self.comparer.compare(kf, work, prior, None, np.eye(4))
+        if self.comparer.believed(near) and near.weight.sum() > view.weight.sum():
+            return near
+        self._follow(before, view, most)
+        return view
+
+    def _last_can_be_keyframe(self) -> bool:
+        return self._flow is not None and self.graph.initialised and self.graph.records[-1].state == "tracked"
 
     def _rejoin(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
@@ -257,7 +274,7 @@ class Slam:
         mask = moving.get()
         kf = graph.add_keyframe(work, static_at(mask, work.px), mask, cam_from_world, inv_depth, info)
         graph.replace_last_by_keyframe(kf)
-        graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px))
+        graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
         self._chain[before.id, kf.id] = view.pair.flow
         self._connect(kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
         recent = [k for k in graph.members()[-2 - self.config.graph.neighbours : -1] if k != before.id]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -41,7 +41,9 @@ class DynamicBelief:
 
     def __init__(self, config: DynamicsConfig, width: int, height: int) -> None:
         """``width``, ``height``: the working size of every image given later."""
-        self.config, self.outline = config, Outline(config, width, height)
+        # a pose needs every static point that there is: here a map is believed where it shows nothing
+        self.config = config = replace(config, semantic_missed=config.semantic_floor)
+        self.outline = Outline(config, width, height)
         self.head = OnlineHead(config)
         w, h = self.outline.w, self.outline.h
         self._nothing = np.zeros((h, w), np.float32)

@@ -124,10 +124,14 @@ class KeyframeGraph:
         self.blocks[kf.id] = Block(work.px, inv_depth, inv_depth.copy(), prior_info, cam_from_world)
         return kf
 
-    def connect(self, i: int, j: int, matches: Matches, static_new: Array) -> bool:
-        """Add matches of i's pixels in j as an edge; False where too few survive the static weight."""
+    def connect(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> bool:
+        """Add matches of i's pixels in j as an edge; False where too few survive the static weight.
+
+        ``followed``: the camera was tracked from i to j. Then few are enough, or the chain would come apart there.
+        """
         weight = matches.weight * self.keyframes[i].static * static_new
-        if (weight > 0.05).mean() < self.config.min_match_ratio or (weight > 0.05).sum() < 20:
+        least = 0.0 if followed else self.config.min_match_ratio
+        if (weight > 0.05).mean() < least or (weight > 0.05).sum() < 20:
             return False
         self.edges.append(Edge(i, j, matches.new_px, weight))
         return True
