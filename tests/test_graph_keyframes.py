@@ -158,6 +158,20 @@ def test_few_matches_make_no_edge(exact_scene: Callable[..., Any]) -> None:
     assert len(graph.edges) == kept
 
 
+def test_the_way_that_was_tracked_is_an_edge_with_few_matches(exact_scene: Callable[..., Any]) -> None:
+    """A tenth of the matches is too few for a pair that may be wrong, and enough to hold a chain together."""
+    scene = exact_scene(2, step=0.2)
+    graph = graph_of(scene, 2)
+    graph.edges.clear()
+    graph.config = GraphConfig(min_match_ratio=0.2)
+    m, p = scene.matches(0, 1), len(scene.px)
+    few = replace(m, weight=np.where(np.arange(p) < 0.1 * p, 1.0, 0.0))
+    assert not graph.connect(0, 1, few, np.ones(p)) and not graph.edges
+    assert graph.connect(0, 1, few, np.ones(p), followed=True) and graph.connected(0, 1)
+    none = replace(m, weight=np.where(np.arange(p) < 15, 1.0, 0.0))
+    assert not graph.connect(0, 1, none, np.ones(p), followed=True)
+
+
 def test_a_record_keeps_the_strongest_matches(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(2, step=0.2, cell_px=8)
     graph = graph_of(scene, 2)

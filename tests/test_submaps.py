@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -342,6 +343,23 @@ def test_forward_and_back_uses_the_keyframes_there_are(room: list[SyntheticView]
     assert run.fit(every).scale * np.linalg.norm(last[:3, 3] - first[:3, 3]) < 0.001 * run.path_m
     assert np.linalg.norm(se3_log(inverse(first) @ last)[3:]) < 0.002
     assert run.ate_ratio(every) < 0.005
+
+
+def turning_fast(time_s: float) -> Array:
+    """24 frames as ever, then 6 degrees more with every frame."""
+    turn_deg = 6.0 * max(10 * time_s - 24, 0.0)
+    return camera_pose(time_s) @ se3_exp(np.array([0, 0, 0, 0, np.deg2rad(turn_deg), 0]))
+
+
+def test_the_chain_has_no_weak_link() -> None:
+    """Where motion alone never asks for a keyframe, one is made before few matches are left."""
+    graph = play(views_of(36, turning_fast), motion_ratio=2.0).slam.graph
+    strength = []
+    for ref, new in pairwise(graph.keyframes):
+        usable = (ref.work.texture * ref.static > 0.05).sum()
+        links = [(e.weight > 0.05).sum() for e in graph.edges if (e.i, e.j) == (ref.id, new.id)]
+        strength.append(max(links, default=0) / usable)
+    assert len(strength) >= 6 and min(strength) > 0.3
 
 
 def turning_away(time_s: float) -> Array:
