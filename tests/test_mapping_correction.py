@@ -9,30 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from mastd3r.mapping.correction import Sight, bend, changes_of, followed, sight
 from mastd3r.mapping.gaussians import GaussianMap, quaternion_product
-from mastd3r.mapping.seed import seed_gaussians
-from mastd3r.types import StaticCloud
+from test_mapping_gaussians import random_map
 
 K = torch.tensor([[60.0, 0, 31.5], [0, 60, 23.5], [0, 0, 1]], dtype=torch.float64)
 CENTRES = {0: (-0.5, 0.0, 0.0), 1: (0.0, 0.1, 0.0), 2: (0.5, 0.0, 0.1)}
-
-
-def random_map(count: int = 200) -> GaussianMap:
-    """Gaussians of all shapes; the first third anchored to keyframe 0, and so on."""
-    rng = np.random.default_rng(0)
-    cloud = StaticCloud(
-        points_world=rng.uniform([-1, -1, 2], [1, 1, 4], (count, 3)).astype(np.float32),
-        colors=rng.integers(0, 256, (count, 3)).astype(np.uint8),
-        confidence=np.ones(count, np.float32),
-        spacing=rng.uniform(0.02, 0.1, count).astype(np.float32),
-        kf_id=(np.arange(count) * 3 // count).astype(np.int32),
-    )
-    gaussians = seed_gaussians(cloud, count, 0)
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        gaussians.quats += torch.randn(count, 4, generator=generator)
-        gaussians.log_scales += 0.5 * torch.randn(count, 3, generator=generator)
-        gaussians.opacity_logits += torch.randn(count, generator=generator)
-    return gaussians
 
 
 def motion(turn: tuple[float, float, float], shift: tuple[float, float, float], scale: float = 1.0) -> np.ndarray:

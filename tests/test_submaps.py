@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -360,6 +361,19 @@ def test_the_chain_has_no_weak_link() -> None:
         links = [(e.weight > 0.05).sum() for e in graph.edges if (e.i, e.j) == (ref.id, new.id)]
         strength.append(max(links, default=0) / usable)
     assert len(strength) >= 6 and min(strength) > 0.3
+
+
+def test_what_passes_in_front_makes_no_keyframes(room: list[SyntheticView]) -> None:
+    """The camera stands still while most of its view is hidden, by something else in every frame."""
+    rng, frames = np.random.default_rng(0), list(room[:16])
+    for _ in range(8):
+        image = room[15].frame.image.copy()
+        hidden = rng.integers(0, 255, (9, 9, 3), np.uint8)
+        image[:, :190] = cv2.resize(hidden, (190, Room.size[1]), interpolation=cv2.INTER_CUBIC)
+        frames.append(replace(room[15], frame=replace(room[15].frame, image=image)))
+    slam = play(frames).slam
+    assert len(slam.graph.keyframes) >= 4
+    assert max(r.index for r in slam.graph.records if r.is_keyframe) <= 16
 
 
 def turning_away(time_s: float) -> Array:

@@ -38,6 +38,7 @@ from .view_depth import (
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+LEAST_MOTION_RATIO = 0.04  # of sqrt(width * height): from the same place a nearer keyframe sees no more of the scene
 FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 
 
@@ -127,7 +128,7 @@ class Slam:
     def _from_nearer(self, work: WorkFrame, prior: Later[Array], view: TwoView) -> TwoView:
         """Few matches are left: the last good frame becomes a keyframe, so that the chain has no weak link."""
         before, last = self._ref, self._last
-        if before is None or last is None or not self._last_can_be_keyframe():
+        if before is None or last is None or not self._last_can_be_keyframe() or view.motion_ratio < LEAST_MOTION_RATIO:
             return view
         most, kf = self._most_matched, self._promote_last(*last)
         near = self.comparer.compare(kf, work, prior, None, np.eye(4))
