@@ -150,11 +150,15 @@ def _linearise(
     lens_cols = np.where(lens.free, np.arange(size - N_GLOBAL, size), -1)
 
     def one(i: int) -> tuple[_Host, Array, Array, float]:
-        return _reduced(blocks, by_host[i], lens, row_of, lens_cols, kernel_px)
+        return _host_part(blocks, by_host[i], lens, row_of, lens_cols, kernel_px)
 
-    for i, (host, local_h, local_b, cost) in zip(by_host, _on_two_threads(one, list(by_host)), strict=True):
+    for i, (host, whole_h, whole_b, cost) in zip(by_host, _on_two_threads(one, list(by_host)), strict=True):
         total += cost
         hosts[i] = host
+        # here, as large products on two threads at once are not the same to the last bit from run to run
+        scaled = host.cross / host.hdd[:, None]
+        local_h = whole_h - scaled.T @ host.cross
+        local_b = whole_b - scaled.T @ host.bd
         keep = host.columns >= 0
         rows = host.columns[keep]
         np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
@@ -166,10 +170,10 @@ def _linearise(
     return hess, rhs, hosts, total
 
 
-def _reduced(
+def _host_part(
     blocks: dict[int, Block], edges: list[Edge], lens: Lens, row_of: dict[int, int], lens_cols: Array, kernel_px: float
 ) -> tuple[_Host, Array, Array, float]:
-    """One host with its depths eliminated: what back-substitution needs, its part of the system, its cost."""
+    """One host: what its depths are eliminated with, its part of the system before that, its cost."""
     i = edges[0].i
     block = blocks[i]
     target, weight, j_from_i = _gather(blocks, edges)
@@ -179,9 +183,6 @@ def _reduced(
     bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
     local_h, local_b, cross = _host_local(h, b, e, j_from_i)
     columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
-    scaled = cross / hdd_i[:, None]
-    local_h -= scaled.T @ cross
-    local_b -= scaled.T @ bd_i
     return _Host(columns, cross, hdd_i, bd_i), local_h, local_b, float(cost.sum())
 
 
