@@ -173,6 +173,15 @@ def test_variants() -> None:
     np.testing.assert_array_equal(paper.moving, paper.probability > 0.5)
 
 
+def test_tracking_believes_a_map_that_shows_nothing() -> None:
+    """Only the second pass doubts it: whatever is doubted here is lost to the pose."""
+    config, nothing = DynamicsConfig(), np.zeros((H, W), np.float32)
+    assert config.semantic_missed > config.semantic_floor
+    surest = (config.semantic_floor / (1 - config.semantic_floor)) ** config.semantic_gain
+    prior = DynamicBelief(config, W, H).prior(frame(0, 3.0)[0], nothing)
+    np.testing.assert_allclose(prior, surest / (1 + surest), rtol=1e-4)
+
+
 def test_wrong_size_is_one_clear_line() -> None:
     belief = DynamicBelief(DynamicsConfig(), W, H)
     with pytest.raises(InputError, match="expected gray of 320x240"):

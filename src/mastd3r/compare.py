@@ -47,14 +47,19 @@ class Comparer:
         graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
         block = graph.blocks[ref.id]
         inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
-        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow)
-        pair = self.parts.provider.predict(ref.work, new, known)  # III-A: both pointmaps, in ref's camera
-        weight = pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)  # (5)(6), softly
-        if near and thin(ref, weight) and (start := self._far_start(ref, new, prior)) is not None:
-            other = self.parts.provider.predict(ref.work, new, replace(known, flow=start))
-            found = other.matches.weight * ref.static * static_at(prior.get(), other.matches.new_px)
-            if found.sum() > weight.sum():
-                pair, weight = other, found
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None)
+
+        def matched(start: Array | None) -> tuple[PairPrediction, Array]:
+            pair = self.parts.provider.predict(
+                ref.work, new, replace(known, flow=start)
+            )  # III-A: both, in ref's camera
+            return pair, pair.matches.weight * ref.static * static_at(
+                prior.get(), pair.matches.new_px
+            )  # (5)(6), softly
+
+        pair, weight = matched(flow)
+        if near and matched_share(ref, weight) < THIN and (start := self._far_start(ref, new, prior)) is not None:
+            pair, weight = max((pair, weight), matched(start), key=lambda found: float(found[1].sum()))
         if started:
             info = graph.depth_info(ref.id)
             matches = StaticMatches(block.px, block.inv_depth, info, pair.matches.new_px, weight, graph.lens.g)
@@ -87,10 +92,12 @@ class Comparer:
         return self.parts.features.flow(kf.work.gray, work.gray, kf.moving / 255.0, prior.get())
 
 
-def thin(ref: Keyframe, weight: Array) -> bool:
-    """Few of the static points that could be matched were, (p,) ``weight``: a fast turn, or someone in front."""
-    usable = int((ref.work.texture * ref.static > 0.05).sum())
-    return int((weight > 0.05).sum()) < THIN * usable
+def matched_share(ref: Keyframe, weight: Array) -> float:
+    """Share of the static points that could be matched that were, (p,) ``weight``.
+
+    Small after a fast turn, or with someone in front.
+    """
+    return int((weight > 0.05).sum()) / max(int((ref.work.texture * ref.static > 0.05).sum()), 1)
 
 
 def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:

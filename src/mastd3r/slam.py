@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .compare import Comparer, TwoView, thin
+from .compare import THIN, Comparer, TwoView, matched_share
 from .config import Config
 from .dynamics.belief import DynamicBelief
 from .geometry.se3 import inverse
@@ -123,22 +123,28 @@ class Slam:
         view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
         if not self.comparer.believed(view):
             return None
-        return self._from_nearer(work, prior, view) if thin(self._ref, view.weight) else view
+        thin = matched_share(self._ref, view.weight) < THIN
+        return self._from_nearer(work, prior, view) if thin else view
 
     def _from_nearer(self, work: WorkFrame, prior: Later[Array], view: TwoView) -> TwoView:
         """Few matches are left: the last good frame becomes a keyframe, so that the chain has no weak link."""
-        before, last = self._ref, self._last
-        if before is None or last is None or not self._last_can_be_keyframe() or view.motion_ratio < LEAST_MOTION_RATIO:
+        before, most = self._ref, self._most_matched
+        assert before is not None
+        if not self.graph.initialised or view.motion_ratio < LEAST_MOTION_RATIO:
             return view
-        most, kf = self._most_matched, self._promote_last(*last)
-        near = self.comparer.compare(kf, work, prior, None, np.eye(4))
-        if self.comparer.believed(near) and near.weight.sum() > view.weight.sum():
+        near = self._from_last(work, prior)
+        if near is not None and near.weight.sum() > view.weight.sum():
             return near
         self._follow(before, view, most)
         return view
 
-    def _last_can_be_keyframe(self) -> bool:
-        return self._flow is not None and self.graph.initialised and self.graph.records[-1].state == "tracked"
+    def _from_last(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
+        """The last good frame becomes a keyframe, which is followed from here on; the frame seen from it, if it is."""
+        last = self._last
+        if last is None or self._flow is None or self.graph.records[-1].state != "tracked":
+            return None
+        near = self.comparer.compare(self._promote_last(*last), work, prior, None, np.eye(4))
+        return near if self.comparer.believed(near) else None
 
     def _rejoin(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
@@ -160,13 +166,10 @@ class Slam:
 
     def _retry(self, work: WorkFrame, prior: Later[Array]) -> tuple[Keyframe, TwoView | None]:
         """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
+        near, graph = self._from_last(work, prior), self.graph
         assert self._ref is not None
-        last, graph = self._last, self.graph
-        if last is not None and self._flow is not None and graph.records[-1].state == "tracked":
-            kf = self._promote_last(*last)
-            near = self.comparer.compare(kf, work, prior, None, np.eye(4))
-            if self.comparer.believed(near):
-                return kf, near
+        if near is not None:
+            return self._ref, near
         places = self.parts.places.best(graph, work, graph.members())
         for kf in [self._ref, *(p for p in places if p.id != self._ref.id)]:
             view = self.comparer.recognised(kf, work, prior)
@@ -251,8 +254,8 @@ class Slam:
             return False
         kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.blocks[near].cam_from_world)
         view = self.comparer.compare(kf, work, moving, rigid_flow_to(graph, near, cam_from_world), guess)
-        share = view.matched / max(int((kf.work.texture * kf.static > 0.05).sum()), 1)
-        if not self.comparer.believed(view) or view.motion_ratio > t.keyframe_motion_ratio or share < 0.4:
+        alike = view.motion_ratio <= t.keyframe_motion_ratio and matched_share(kf, view.weight) >= 0.4
+        if not self.comparer.believed(view) or not alike:
             return False
         if abs(near - ref.id) > 1 and not graph.connected(near, ref.id) and self._connect_both(near, ref.id):
             log.info("keyframes %d and %d see the same place", near, ref.id)

@@ -155,7 +155,7 @@ def _linearise(
     for i, (host, whole_h, whole_b, cost) in zip(by_host, _on_two_threads(one, list(by_host)), strict=True):
         total += cost
         hosts[i] = host
-        # here, as large products on two threads at once are not the same to the last bit from run to run
+        # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
         scaled = host.cross / host.hdd[:, None]
         local_h = whole_h - scaled.T @ host.cross
         local_b = whole_b - scaled.T @ host.bd

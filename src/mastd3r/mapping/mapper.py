@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +23,8 @@ from .seed import seed_gaussians
 from .splat import as_pictures
 from .threads import one_torch_thread
 from .view_parameters import ViewParameters
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -157,10 +159,10 @@ class Mapper:
 
     def _sights(self) -> Iterator[Sight]:
         """What a part of the views sees of the map now."""
-        for number in np.unique(np.linspace(0, len(self._views) - 1, MAX_SIGHTS).round().astype(int)):
-            view, (_, weight) = self._views[number], self._target(int(number))
+        for number in _evenly(range(len(self._views)), MAX_SIGHTS):
+            view, (_, weight) = self._views[number], self._target(number)
             K = torch.from_numpy(view.camera.matrix).to(self._device)
-            pose = self._view_parameters.cam_from_world(int(number))
+            pose = self._view_parameters.cam_from_world(number)
             yield sight(self._map, view.kf_id, pose, K, weight, self._near)
 
     def _draw(
@@ -246,10 +248,10 @@ def _checked_views(views: list[View]) -> list[View]:
     return views
 
 
-def _evenly(views: list[View], limit: int) -> list[View]:
-    if len(views) <= limit:
-        return views
-    return [views[i] for i in np.unique(np.linspace(0, len(views) - 1, limit).round().astype(int))]
+def _evenly(items: Sequence[T], limit: int) -> list[T]:
+    if len(items) <= limit:
+        return list(items)
+    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, limit).round().astype(int))]
 
 
 def _depths(gaussians: GaussianMap, views: list[View]) -> tuple[float, float]:
