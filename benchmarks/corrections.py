@@ -28,6 +28,7 @@ from mastd3r.config import Config, CorrectionKind
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.geometry.se3 import inverse
+from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import Parts
 from mastd3r.pointmap.geometric import working_size
 from mastd3r.slam import Slam
@@ -47,6 +48,7 @@ class FrontEnd(Slam):
         self.graph.solve_all = lambda *_: None  # type: ignore[assignment,method-assign,return-value]
 
 
+@one_blas_thread()
 def tracked(source: Source, config: Config, errors: NetworkErrors, seed: int) -> dict[str, Any]:
     """ATE of the path as tracked, and how it went."""
     size = working_size(*source.size, config.tracking.area_px)

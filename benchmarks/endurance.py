@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from mastd3r.config import Config, SourceConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.finish import final_frames, finish_graph, trajectory_of
+from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import build_parts
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
@@ -68,6 +69,7 @@ def rss_mib() -> float:
     return pages * resource.getpagesize() / 2**20
 
 
+@one_blas_thread()
 def measure(source: Source, what: str, config: Config) -> dict[str, Any]:
     """Track one arrangement and say how it went."""
     order, black = order_of(what, source.length or 0)

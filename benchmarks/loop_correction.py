@@ -27,6 +27,7 @@ from mastd3r.evaluation.image_error import psnr
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.trajectory_files import read_tum
+from mastd3r.lookahead import one_blas_thread
 from mastd3r.mapping.mapper import Mapper
 from mastd3r.run import MapMaterial
 from mastd3r.sources import open_source
@@ -78,6 +79,7 @@ def by_anchors(mapper: Mapper, drift: dict[int, np.ndarray], right: dict[int, np
     return other
 
 
+@one_blas_thread()
 def main() -> int:
     """Train, correct, train on."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

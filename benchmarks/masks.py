@@ -26,6 +26,7 @@ from mastd3r.export.machine import machine_info
 from mastd3r.export.pictures import mask_overlay
 from mastd3r.finish import FinalFrame, final_frames, finish_graph
 from mastd3r.lens_view import LensView
+from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import build_parts
 from mastd3r.run import run
 from mastd3r.second_pass import Look, SeenMask, second_pass
@@ -52,6 +53,7 @@ PERFECT = ("semantic_share=0.0", "semantic_gain=1.0", "semantic_floor=0.001", "s
 STARTS = range(5)
 
 
+@one_blas_thread()
 def main() -> int:
     """Run what is asked for and missing; the file is rewritten after every entry."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

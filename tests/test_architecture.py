@@ -56,7 +56,7 @@ LAYERS: dict[str, set[str]] = {
     "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},
     "run": {
         "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
-        "view_depth", "showcase", "live_map",
+        "view_depth", "showcase", "live_map", "lookahead",
     },
     "experiments": {"config", "errors", "evaluation", "export"},
     "cli_weights": {"errors", "fetch", "networks", "progress"},

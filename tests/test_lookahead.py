@@ -5,11 +5,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
-from mastd3r.lookahead import Beside, Later, ahead
+import mastd3r.run as run_module
+from mastd3r.config import Config
+from mastd3r.errors import SlamError
+from mastd3r.lookahead import Beside, Later, ahead, one_blas_thread
 from mastd3r.parts import Parts
 from mastd3r.types import WorkFrame
 from test_pointmap_mast3r import TrueNetwork, photograph, provider_of
@@ -95,3 +100,31 @@ def test_frames_seen_ahead_are_those_seen_in_turn(pairs_ahead: bool) -> None:
         np.testing.assert_array_equal(a.gray, b.gray)
     assert encoded == encoded_too == 5 and decoded_too == 5
     assert decoded == (6 if pairs_ahead else 5)  # one was beside the keyframe of before
+
+
+def blas_threads() -> list[int]:
+    return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+
+def test_blas_computes_in_the_thread_that_calls_it_and_gets_its_own_back() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        with one_blas_thread():
+            assert set(blas_threads()) == {1}
+        assert max(blas_threads()) == 2
+
+
+def test_a_run_has_one_blas_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stopped(SlamError):
+        pass
+
+    seen = []
+
+    def job(*_: object) -> None:
+        seen.extend(blas_threads())
+        raise Stopped
+
+    monkeypatch.setattr(run_module, "_job", job)
+    for call in (run_module.run, run_module.material_for_map):
+        with threadpool_limits(limits=2, user_api="blas"), pytest.raises(Stopped):
+            call(tmp_path, tmp_path / "out", Config())
+    assert set(seen) == {1}

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Generic, TypeVar
+
+from threadpoolctl import threadpool_limits
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -59,3 +62,14 @@ def ahead(items: Iterator[T], work: Callable[[T, C], None], context: Callable[[]
         while (item := job.result()) is not end:
             job = pool.submit(one, context())
             yield item  # type: ignore[misc]
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within it BLAS computes in the thread that calls it, whatever library brought it.
+
+    Our products are small and many: BLAS's own threads would spin between them on the cores that our threads need,
+    which costs more than half of the processor's time on two cores.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield

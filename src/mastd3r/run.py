@@ -29,6 +29,7 @@ from .finish import FinalFrame, final_frames, finish_graph, static_cloud, trajec
 from .geometry.camera import Camera
 from .lens_view import LensView
 from .live_map import LiveMap
+from .lookahead import one_blas_thread
 from .mapping.mapper import Mapper
 from .mapping.ply import write_gaussians_ply
 from .mapping.process import Outcome
@@ -66,6 +67,7 @@ class MapMaterial:
     lens_view: LensView
 
 
+@one_blas_thread()
 def run(
     source_path: str | Path,
     out: Path,
@@ -90,6 +92,7 @@ def run(
     return RunResult(job.folder.path, job.metrics)
 
 
+@one_blas_thread()
 def material_for_map(source_path: str | Path, out: Path, config: Config) -> MapMaterial:
     """Everything of ``run`` that comes before the map, for those who train several on the same. Raises as ``run``."""
     return _job(source_path, out, config, [], Silent(), None).before_map()[1]
