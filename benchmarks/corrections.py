@@ -45,6 +45,7 @@ class FrontEnd(Slam):
     def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
         super().__init__(config, parts, full_size)
         self.graph.solve_window = lambda: None  # type: ignore[assignment,method-assign,return-value]
+        self.graph.solve_depths = lambda *_: None  # type: ignore[method-assign]
         self.graph.solve_all = lambda *_: None  # type: ignore[assignment,method-assign,return-value]
 
 

@@ -48,7 +48,8 @@ LAYERS: dict[str, set[str]] = {
     "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lookahead"},
     "finish": {"geometry", *CONTRACTS, *STAGES},
     "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare", "lookahead"},
-    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "lookahead", "loops"},
+    "links": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
+    "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "links", "lookahead", "loops"},
     "second_pass": {
         "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify", "lookahead",
     },

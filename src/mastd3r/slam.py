@@ -16,28 +16,28 @@ from .geometry.se3 import inverse
 from .graph.bootstrap import bootstrap
 from .graph.bundle import Lens
 from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
-from .graph.places import covisible, nearest_keyframe
+from .graph.places import nearest_keyframe
 from .graph.submaps import join, scale_between
+from .links import Links
 from .lookahead import Beside, Later
 from .loops import close_loops, widen
 from .parts import Near, Parts
 from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
-from .types import Frame, Guess, State, WorkFrame
+from .types import Frame, State, WorkFrame
 from .view_depth import (
-    chained_flow,
     dynamics_input,
     grown,
     invert_flow,
     own_depth_prior,
     predicted_depth,
-    rigid_flow,
     rigid_flow_to,
     static_at,
 )
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+TIED_AFTER = 4  # frames after a keyframe until its ties are taken: at the same frame however fast they were made
 LEAST_MOTION_RATIO = 0.04  # of sqrt(width * height): from the same place a nearer keyframe sees no more of the scene
 FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 
@@ -75,7 +75,9 @@ class Slam:
         self.belief = DynamicBelief(config.dynamics, width, height)
         self.comparer = Comparer(config, parts, self.graph)
         self._mask = Beside("mask")  # the belief lives in its thread: it is updated while the next frame is matched
-        self._chain: dict[tuple[int, int], Array] = {}  # flows between keyframes, before there are poses
+        self.links = Links(config.graph, parts)
+        self._tying = Beside("ties")
+        self._tied: tuple[int, Later[KeyframeGraph]] | None = None  # after how many records it is taken, and the graph
         self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
         self._before_loss: Keyframe | None = None  # the same, when the camera was lost
         self._flow: Array | None = None  # ref -> last frame
@@ -90,6 +92,8 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
+        if self._tied is not None and len(self.graph.records) >= self._tied[0]:
+            self._settle()
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
@@ -159,7 +163,7 @@ class Slam:
                 log.info("frame %d found again from keyframe %d", work.index, kf.id)
                 graph.drop_submap()
                 graph.submap = graph.submap_of[kf.id]
-                self._chain.clear()
+                self.links.flows.clear()
                 self._follow(kf, view, 0)
                 return view
         return None
@@ -184,6 +188,7 @@ class Slam:
 
     def close(self) -> None:
         """After the last frame: keep what it alone sees, and join the submaps that can be."""
+        self._settle()
         graph = self.graph
         if self._last is not None:
             self._last[1].get()
@@ -202,7 +207,7 @@ class Slam:
         for submap in sorted(graph.started):
             graph.submap = submap
             close_loops(self.comparer, graph, self.parts.places)
-            widen(graph, self._connect_both)
+            widen(graph, lambda i, j: self.links.both(graph, i, j))
 
     # -- keyframes -------------------------------------------------------------------------------------------
 
@@ -223,6 +228,7 @@ class Slam:
 
     def _start_again(self, work: WorkFrame, prior: Later[Array]) -> StepReport:
         """The camera is lost: what follows is a submap of its own until it is recognised."""
+        self._settle()
         graph, ref = self.graph, self._ref
         why = "the view before it cannot be followed into it, and no keyframe looks like it"
         log.info("frame %d lost: %s", work.index, why)
@@ -230,7 +236,7 @@ class Slam:
             self._before_loss = ref
         else:
             graph.drop_submap()
-        self._chain.clear()
+        self.links.flows.clear()
         graph.start_submap()
         return self._start(work, prior, why)
 
@@ -257,9 +263,11 @@ class Slam:
         alike = view.motion_ratio <= t.keyframe_motion_ratio and matched_share(kf, view.weight) >= 0.4
         if not self.comparer.believed(view) or not alike:
             return False
-        if abs(near - ref.id) > 1 and not graph.connected(near, ref.id) and self._connect_both(near, ref.id):
-            log.info("keyframes %d and %d see the same place", near, ref.id)
-            graph.solve_all(4, 1.0)
+        if abs(near - ref.id) > 1 and not graph.connected(near, ref.id):
+            self._settle()
+            if self.links.both(graph, near, ref.id):
+                log.info("keyframes %d and %d see the same place", near, ref.id)
+                graph.solve_all(4, 1.0)
         self._follow(kf, view, view.matched)
         return True
 
@@ -270,6 +278,7 @@ class Slam:
 
     def _add_keyframe(self, work: WorkFrame, moving: Later[Array], view: TwoView) -> Keyframe:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
+        self._settle()
         graph, before = self.graph, self._ref
         assert before is not None
         cam_from_world = view.alignment.new_from_ref @ graph.blocks[before.id].cam_from_world
@@ -279,32 +288,38 @@ class Slam:
         kf = graph.add_keyframe(work, static_at(mask, work.px), mask, cam_from_world, inv_depth, info)
         graph.replace_last_by_keyframe(kf)
         graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
-        self._chain[before.id, kf.id] = view.pair.flow
-        self._connect(kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
-        recent = [k for k in graph.members()[-2 - self.config.graph.neighbours : -1] if k != before.id]
-        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before.id, *reversed(recent))])
-        for k in reversed(recent):
-            self._connect_both(k, kf.id)
+        if not graph.initialised:
+            self.links.flows[before.id, kf.id] = view.pair.flow
+        self.links.one(graph, kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
         self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
         self._last = (work, moving)
-        if not graph.initialised:
-            if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
-                self._chain.clear()
-        else:
-            self._extend(kf, min(recent, default=before.id))
+        if graph.initialised:
+            self._tie(kf, before.id)
+            return kf
+        self.links.to_recent(graph, kf, before.id)
+        if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
+            self.links.flows.clear()
         return kf
 
-    def _extend(self, kf: Keyframe, recent_from: int) -> None:
-        """Older keyframes that see the same place, the window, and now and then everything."""
-        graph, c = self.graph, self.config.graph
-        older = covisible(graph, kf.id, recent_from, c.covisible, c.loop_overlap_ratio)
-        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
-        for k in older:
-            self._connect_both(k, kf.id)
-        graph.solve_window()
-        joined = len(graph.started) > 1 and self._joins(kf)
-        if not joined and len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256):
+    def _tie(self, kf: Keyframe, before: int) -> None:
+        """Tie a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
+        graph = self.graph
+        everything = len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256)
+        if self.parts.provider.side_by_side and not (graph.window_is_all or everything or len(graph.started) > 1):
+            graph.solve_depths(kf.id)
+            aside = graph.aside()
+            later = self._tying.later(lambda: self.links.tie(aside, kf, before))
+            self._tied = (len(graph.records) + TIED_AFTER, later)
+            return
+        self.links.tie(graph, kf, before)
+        if not (len(graph.started) > 1 and self._joins(kf)) and everything:
             graph.solve_all(6, 1.0)
+
+    def _settle(self) -> None:
+        """Wait for the ties of the newest keyframe, and take them into the graph."""
+        if self._tied is not None:
+            tied, self._tied = self._tied[1], None
+            self.graph.take(tied.get())
 
     def _joins(self, kf: Keyframe) -> bool:
         """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
@@ -323,29 +338,10 @@ class Slam:
             join(graph, other.id, kf.id, pose, scale)
             for k in range(max(0, other.id - 2), min(len(graph.keyframes), other.id + 3)):
                 if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:
-                    self._connect_both(k, kf.id)
+                    self.links.both(graph, k, kf.id)
             graph.solve_all(10, 2.0)
             return True
         return False
-
-    def _connect_both(self, i: int, j: int) -> bool:
-        grid_px = self.parts.grid_px
-        if self.graph.initialised:
-            start, back = rigid_flow(self.graph, i, j), rigid_flow(self.graph, j, i)
-        elif (i, j - 1) in self._chain and (j - 1, j) in self._chain:
-            start = chained_flow(self._chain[i, j - 1], self._chain[j - 1, j], grid_px)
-            back = invert_flow(start, grid_px)
-        else:
-            return False
-        return self._connect(i, j, start) and self._connect(j, i, back)
-
-    def _connect(self, i: int, j: int, flow: Array) -> bool:
-        ref, new = self.graph.keyframes[i], self.graph.keyframes[j]
-        guess = Guess(self.graph.camera(), flow=flow, flow_is_near=self.graph.initialised)
-        pair = self.parts.provider.predict(ref.work, new.work, guess)
-        if not self.graph.initialised:
-            self._chain[i, j] = pair.flow
-        return self.graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
 
     def _update_belief(
         self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Later[Array], looks: Later[Array | None]

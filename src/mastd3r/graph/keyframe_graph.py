@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -201,6 +202,20 @@ class KeyframeGraph:
         out.records = [r for r in self.records if r.kf_id in ids]
         return out
 
+    def aside(self) -> KeyframeGraph:
+        """A copy to which edges may be added, and whose window may be solved, while this one is read."""
+        out = copy.copy(self)
+        out.keyframes, out.edges, out.records = list(self.keyframes), list(self.edges), []
+        out.blocks = {k: copy.copy(b) for k, b in self.blocks.items()}
+        out.lens = copy.copy(self.lens)
+        return out
+
+    def take(self, aside: KeyframeGraph) -> None:
+        """Edges, poses, depths and lens of a copy; nothing may have been added here since."""
+        if len(aside.keyframes) != len(self.keyframes):
+            raise ValueError(f"take: expected a copy of {len(self.keyframes)} keyframes, got {len(aside.keyframes)}")
+        self.edges, self.blocks, self.lens = aside.edges, aside.blocks, aside.lens
+
     # -- optimisation ----------------------------------------------------------------------------------------
 
     def solve_window(self) -> SolveReport:
@@ -225,6 +240,17 @@ class KeyframeGraph:
         if whole and self.submap == 0:
             self.normalise()
         return report
+
+    def solve_depths(self, kf_id: int, iterations: int = 3) -> None:
+        """The depths of one keyframe from the edges that it has; poses and lens stay."""
+        edges = [e for e in self.edges if e.i == kf_id]
+        near = {k: self.blocks[k] for k in sorted({kf_id, *(e.j for e in edges)})}
+        solve(near, edges, self._lens_with(range(N_GLOBAL)), fixed=frozenset(near), iterations=iterations)
+
+    @property
+    def window_is_all(self) -> bool:
+        """True while the sliding window holds every keyframe of the submap being tracked."""
+        return len(self.members()) <= self.config.window
 
     def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
         """Every keyframe moves but the first of each submap."""

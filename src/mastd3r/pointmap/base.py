@@ -14,6 +14,7 @@ class PointmapProvider(Protocol):
     name: str
     depth_sigma_ratio: float | None  # relative 1-sigma of the depth measured in one frame; None: measures none
     finds_far: bool  # ``predict`` matches views of one place without a start, however far apart in the image
+    side_by_side: bool  # ``predict`` may be asked in two threads at once
 
     def look(self, frame: Frame) -> WorkFrame:
         """What can be said of a frame alone: working image, pixels to match, own depth. May run in another thread."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from threading import local
 from typing import Any
 
 import cv2
@@ -36,22 +37,29 @@ class FlowMatcher:
         self.width, self.height = width, height
         self.tolerance_px = tolerance_px
         self.border_px = window_px // 2 + 1
-        self._dis = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        self._started = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)  # half the time of medium
-        self._started.setFinestScale(1)
-        self._started.setGradientDescentIterations(12)
-        self._started.setVariationalRefinementIterations(2)
-        self._fast = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._of_thread = local()
         x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
         self._grid = np.stack([x, y], -1)
         self._window = window(window_px, 0.27 * window_px)
 
+    def _engine(self, name: str) -> Any:
+        """``whole``, ``rest`` or ``fast``; the calling thread's own: an engine has memory and serves one at a time."""
+        if not hasattr(self._of_thread, "engines"):
+            whole = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+            rest, fast = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST) for _ in range(2))
+            rest.setFinestScale(1)  # half the time of medium
+            rest.setGradientDescentIterations(12)
+            rest.setVariationalRefinementIterations(2)
+            self._of_thread.engines = {"whole": whole, "rest": rest, "fast": fast}
+        return self._of_thread.engines[name]
+
     def dense(self, ref: Array, new: Array, start: Array | None = None, *, fast: bool = False) -> Array:
         """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched."""
         if start is None:
-            return self._dis.calc(ref, new, None)
+            flow: Array = self._engine("whole").calc(ref, new, None)
+            return flow
         warped = self.warp(new, start)
-        rest = (self._fast if fast else self._started).calc(ref, warped, None)
+        rest = self._engine("fast" if fast else "rest").calc(ref, warped, None)
         moved = cv2.remap(start, self._grid + rest, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return moved + rest
 

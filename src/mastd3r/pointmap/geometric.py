@@ -32,6 +32,7 @@ class GeometricPointmaps(Observing):
     name = "geometric"
     depth_sigma_ratio: float | None = None
     finds_far = False
+    side_by_side = True
 
     def __init__(self, width: int, height: int, cell_px: int) -> None:
         self.width, self.height, self.cell_px = width, height, cell_px

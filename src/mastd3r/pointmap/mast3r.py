@@ -102,6 +102,7 @@ class Mast3rPointmaps(Observing):
 
     name = "mast3r"
     finds_far = True  # the search on rays finds its way from the same pixel, without a start
+    side_by_side = False  # one accelerator, and a memory of pairs
 
     def __init__(
         self,

@@ -1,0 +1,67 @@
+"""Matches between keyframes: what a new one is tied to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from .config import GraphConfig
+from .graph.keyframe_graph import Keyframe, KeyframeGraph
+from .graph.places import covisible
+from .parts import Parts
+from .types import Guess
+from .view_depth import chained_flow, invert_flow, rigid_flow, static_at
+
+Array = NDArray[Any]
+
+
+class Links:
+    """Makes edges of a graph. Before there are poses, the flows between keyframes are kept as starts of the next."""
+
+    def __init__(self, config: GraphConfig, parts: Parts) -> None:
+        self.config, self.parts = config, parts
+        self.flows: dict[tuple[int, int], Array] = {}  # between keyframes, before there are poses
+
+    def tie(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> KeyframeGraph:
+        """Matches of ``kf`` with the keyframes before ``before`` and older ones that see the same; the window solved.
+
+        ``graph`` has poses; it is returned.
+        """
+        recent = self.to_recent(graph, kf, before)
+        c = self.config
+        older = covisible(graph, kf.id, min(recent, default=before), c.covisible, c.loop_overlap_ratio)
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
+        for k in older:
+            self.both(graph, k, kf.id)
+        graph.solve_window()
+        return graph
+
+    def to_recent(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> list[int]:
+        """Matches with the ``neighbours`` last keyframes; those but ``before``, with which there are some already."""
+        recent = [k for k in graph.members()[-2 - self.config.neighbours : -1] if k != before]
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before, *reversed(recent))])
+        for k in reversed(recent):
+            self.both(graph, k, kf.id)
+        return recent
+
+    def both(self, graph: KeyframeGraph, i: int, j: int) -> bool:
+        """Edges both ways; False where one fails, or where nothing says how to start."""
+        grid_px = self.parts.grid_px
+        if graph.initialised:
+            start, back = rigid_flow(graph, i, j), rigid_flow(graph, j, i)
+        elif (i, j - 1) in self.flows and (j - 1, j) in self.flows:
+            start = chained_flow(self.flows[i, j - 1], self.flows[j - 1, j], grid_px)
+            back = invert_flow(start, grid_px)
+        else:
+            return False
+        return self.one(graph, i, j, start) and self.one(graph, j, i, back)
+
+    def one(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
+        """The edge of i's pixels in j, searched from ``flow`` (h, w, 2)."""
+        ref, new = graph.keyframes[i], graph.keyframes[j]
+        guess = Guess(graph.camera(), flow=flow, flow_is_near=graph.initialised)
+        pair = self.parts.provider.predict(ref.work, new.work, guess)
+        if not graph.initialised:
+            self.flows[i, j] = pair.flow
+        return graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
