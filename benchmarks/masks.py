@@ -1,10 +1,11 @@
 """What the masks are worth: ablation of every evidence term, false positives, cost, and what they do for the pose.
 
 usage: python benchmarks/masks.py --data DIR --out benchmarks/results/masks.json [--what PART …] [--only SEQUENCE …]
-Parts: ablation (IoU of each variant; one tracking result a sequence), static (false positives where nothing moves),
-cost (share of tracking time), twin (ATE of kitchen_walk against the clean kitchen), off (ATE without masks, five
-starts), perfect (ATE with the true masks given). Finished entries of an existing file are kept. The overlay of every
-frame is masks.mp4 in each run folder; ``--sheets DIR`` writes contact sheets there (the pictures stay with the reader).
+Parts: ablation (IoU of the default on all frames, and of each variant on those in the middle of the sequence), static
+(false positives where nothing moves), cost (share of tracking time), twin (ATE of kitchen_walk against the clean
+kitchen), off (ATE without masks, five starts), perfect (ATE with the true masks given). A sequence is tracked once for
+all parts that ask the same of it. Finished entries of an existing file are kept, so a run that was stopped goes on.
+``--sheets DIR`` writes contact sheets there (the pictures stay with the reader).
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import astuple, dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +23,15 @@ import cv2
 import numpy as np
 
 from mastd3r.config import Config, with_override
+from mastd3r.evaluation.evaluate import evaluate_trajectory
 from mastd3r.evaluation.mask_error import mask_error, read_mask
+from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.pictures import mask_overlay
-from mastd3r.finish import FinalFrame, final_frames, finish_graph
+from mastd3r.finish import FinalFrame, final_frames, finish_graph, trajectory_of
 from mastd3r.lens_view import LensView
 from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import build_parts
-from mastd3r.run import run
 from mastd3r.second_pass import Look, SeenMask, second_pass
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
@@ -51,6 +54,8 @@ VARIANTS: dict[str, tuple[str, ...]] = {
 }
 PERFECT = ("semantic_share=0.0", "semantic_gain=1.0", "semantic_floor=0.001", "semantic_missed=0.001", "use_head=false")
 STARTS = range(5)
+ABLATED = 48  # frames in the middle of each sequence that variants are compared on
+TRACKED = ("ate_rmse_all", "ate_rmse_keyframes", "frames_posed", "mask_s", "tracking_s")
 
 
 @one_blas_thread()
@@ -59,49 +64,113 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="folder that holds the sequences")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--runs", type=Path, default=Path("runs/masks"))
     parser.add_argument("--what", nargs="*", default=list(PARTS), choices=list(PARTS))
     parser.add_argument("--only", nargs="*", default=None, help="sequences")
     parser.add_argument("--sheets", type=Path, default=None, help="where contact sheets go")
     args = parser.parse_args()
-    done: dict[str, Any] = json.loads(args.out.read_text()) if args.out.is_file() else {}
-
-    def keep(part: str, name: str, entry: Callable[[], dict[str, Any]]) -> None:
-        if name not in done.setdefault(part, {}):
-            info = machine_info()
-            stamp = {k: info[k] for k in ("git_commit", "processor", "cores")} | {"date": time.strftime("%Y-%m-%d")}
-            done[part][name] = entry() | stamp
-            args.out.write_text(json.dumps(done, indent=1) + "\n")
-            print(part, name, {k: v for k, v in done[part][name].items() if k not in stamp}, flush=True)
-
+    results = Results(args.data, args.out)
     for part in args.what:
-        PARTS[part](args, keep)
+        PARTS[part](args, results)
     return 0
 
 
-Keep = Callable[[str, str, Callable[[], dict[str, Any]]], None]
+@dataclass(frozen=True)
+class Task:
+    """One way to track one sequence."""
+
+    sequence: str
+    semantics: str
+    start: int = 0
+    end: int | None = None
+    dynamics: tuple[str, ...] = ()  # overrides of options of the mask
+    maps: str | None = None  # folder of the sequence whose images are given as maps
+
+    def config(self) -> Config:
+        """All options."""
+        config = replace(Config(), semantics=self.semantics)  # type: ignore[arg-type]
+        config = replace(config, source=replace(config.source, start=self.start, end=self.end))
+        return _with_masks(config, self.dynamics)
+
+
+def _with_masks(config: Config, overrides: tuple[str, ...]) -> Config:
+    for words in overrides:
+        config = with_override(config, f"dynamics.{words}")
+    return config
+
+
+class Results:
+    """The file of figures, and the sequence that was tracked last."""
+
+    def __init__(self, data: Path, out: Path) -> None:
+        self.data, self.out = data, out
+        self.done: dict[str, Any] = json.loads(out.read_text()) if out.is_file() else {}
+        self._task: Task | None = None
+        self._tracked: Tracked | None = None
+
+    def keep(self, where: tuple[str, ...], entry: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """The entry under these keys, which is made only if it is not there."""
+        place = self.done
+        for key in where[:-1]:
+            place = place.setdefault(key, {})
+        if where[-1] not in place:
+            info = machine_info()
+            stamp = {k: info[k] for k in ("git_commit", "processor", "cores")} | {"date": time.strftime("%Y-%m-%d")}
+            figures = entry()
+            place[where[-1]] = figures | stamp
+            self.out.write_text(json.dumps(self.done, indent=1) + "\n")
+            print(*where, figures, flush=True)
+        found: dict[str, Any] = place[where[-1]]
+        return found
+
+    def tracked(self, task: Task) -> Tracked:
+        """The sequence tracked that way; only the last one is held."""
+        if self._tracked is None or self._task != task:
+            self._tracked = None
+            self._task, self._tracked = task, Tracked(self.data, task)
+        return self._tracked
+
+    def poses(self, task: Task) -> dict[str, Any]:
+        """ATE and times of tracking that way; kept in the file."""
+        name = ", ".join(str(v) for v in astuple(task) if v not in (None, 0, ()))
+        kept = self.keep(("tracking", name), lambda: self.tracked(task).figures)
+        return {k: kept[k] for k in TRACKED}
 
 
 class Tracked:
     """One sequence, tracked and solved once, for as many second passes as are wanted."""
 
-    def __init__(self, folder: Path, semantics: str, end: int | None = None) -> None:
-        config = Config()
-        self.config = replace(config, semantics=semantics, source=replace(config.source, end=end))  # type: ignore[arg-type]
-        source = open_source(folder, self.config.source, want_depth=False, want_semantic=semantics == "maps")
-        self.source: Source = source
-        self.slam = Slam(self.config, build_parts(self.config, source), source.size)
+    def __init__(self, data: Path, task: Task) -> None:
+        self.config = config = task.config()
+        folder = data / task.sequence
+        maps = None if task.maps is None else folder / task.maps
+        self.source: Source = open_source(
+            folder, config.source, want_depth=False, want_semantic=task.semantics == "maps", semantic_dir=maps
+        )
+        self.slam = Slam(config, build_parts(config, self.source), self.source.size)
         self.mask_s = self.tracking_s = 0.0
         belief = self.slam.belief
         belief.prior = self._clocked(belief.prior)  # type: ignore[method-assign]
         belief.update = self._clocked(belief.update)  # type: ignore[method-assign]
-        for frame in source.frames():
+        for frame in self.source.frames():
             began = time.perf_counter()
             self.slam.step(frame)
             self.tracking_s += time.perf_counter() - began
         self.slam.close()
-        finish_graph(self.slam.graph, self.config)
+        finish_graph(self.slam.graph, config)
         self.final: list[FinalFrame] = final_frames(self.slam.graph)
+        self.figures = dict.fromkeys(TRACKED) | self._poses()
+        self.figures |= {"mask_s": self.mask_s, "tracking_s": self.tracking_s}
+
+    def _poses(self) -> dict[str, Any]:
+        trajectory, truth = trajectory_of(self.final), self.source.truth()
+        if truth is None or not len(truth.timestamps_s):
+            return {"frames_posed": int(np.isfinite(trajectory.world_from_cam).all((1, 2)).sum())}
+        found = evaluate_trajectory(trajectory, truth, trajectory.timestamps_s).metrics
+        return {
+            "ate_rmse_all": found["ate_rmse_all"],
+            "ate_rmse_keyframes": ate_rmse(trajectory.keyframes(), truth).rmse,
+            "frames_posed": found["frames_posed"],
+        }
 
     def _clocked(self, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*given: Any) -> Any:
@@ -113,11 +182,14 @@ class Tracked:
 
         return timed
 
-    def masks(self, overrides: tuple[str, ...], each: Callable[[SeenMask], None] | None = None) -> dict[str, Any]:
-        """Figures of the second pass under other options of the mask."""
-        config = self.config
-        for words in overrides:
-            config = with_override(config, f"dynamics.{words}")
+    def masks(
+        self,
+        overrides: tuple[str, ...],
+        each: Callable[[SeenMask], None] | None = None,
+        frames: tuple[int, int] | None = None,
+    ) -> dict[str, Any]:
+        """Figures of the second pass under other options of the mask; ``frames``: from, and one past the last."""
+        config = _with_masks(self.config, overrides)
         config = replace(config, mapping=replace(config.mapping, enabled=False))
         truth = self.source.truth()
         files = {} if truth is None else truth.moving_files
@@ -132,33 +204,47 @@ class Tracked:
 
         lens_view = LensView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
         look = Look(self.final, self.slam.graph, self.slam.parts, config, lens_view, head=self.slam.belief.head.copy())
-        second_pass(self.source.frames(), look, on_mask)
+        second_pass(islice(self.source.frames(), *(frames or (None,))), look, on_mask)
         found = mask_error(pairs)
         return {"iou": found.iou, "false_positives": found.false_positive_ratio, "moving": found.called_moving_ratio}
 
+    def middle(self) -> tuple[int, int]:
+        """The frames that variants are compared on."""
+        first = max(0, (len(self.final) - ABLATED) // 2)
+        return first, min(len(self.final), first + ABLATED)
 
-def ablation(args: argparse.Namespace, keep: Keep) -> None:
+
+def ablation(args: argparse.Namespace, results: Results) -> None:
     """IoU of every variant, with and without the maps that come with the sequence."""
     for name in (n for n in MOVING if args.only is None or n in args.only):
         for semantics in ("none", "maps"):
-            keep("ablation", f"{name}, {semantics}", lambda n=name, s=semantics: _variants(args.data / n, s))  # type: ignore[misc]
+            _ablate(results, Task(name, semantics))
 
 
-def _variants(folder: Path, semantics: str) -> dict[str, Any]:
-    tracked = Tracked(folder, semantics)
-    names = [v for v in VARIANTS if semantics == "maps" or "semantics" not in v]
-    return {v: tracked.masks(VARIANTS[v]) for v in names}
+def _ablate(results: Results, task: Task) -> None:
+    where = "ablation", f"{task.sequence}, {task.semantics}"
+    results.poses(task)  # first, as it holds what the masks are made from
+    results.keep((*where, "ours, all frames"), lambda: results.tracked(task).masks(()))
+    for variant, overrides in VARIANTS.items():
+        if task.semantics == "maps" or "semantics" not in variant:
+            results.keep((*where, variant), lambda o=overrides: _of_middle(results.tracked(task), o))  # type: ignore[misc]
 
 
-def static(args: argparse.Namespace, keep: Keep) -> None:
+def _of_middle(tracked: Tracked, overrides: tuple[str, ...]) -> dict[str, Any]:
+    frames = tracked.middle()
+    return tracked.masks(overrides, frames=frames) | {"frames": list(frames)}
+
+
+def static(args: argparse.Namespace, results: Results) -> None:
     """What is called moving where nothing moves, and in the sequences that are only looked at."""
     for name in (n for n in STILL + LOOKED_AT if args.only is None or n in args.only):
-        keep("static", name, lambda n=name: _looked_at(args, n))  # type: ignore[misc]
+        results.keep(("static", name), lambda n=name: _looked_at(args, results, n))  # type: ignore[misc]
 
 
-def _looked_at(args: argparse.Namespace, name: str) -> dict[str, Any]:
+def _looked_at(args: argparse.Namespace, results: Results, name: str) -> dict[str, Any]:
     pictures: list[Any] = []
-    figures = Tracked(args.data / name, "none").masks((), lambda seen: pictures.append(_small_overlay(seen)))
+    tracked = results.tracked(Task(name, "none"))
+    figures = tracked.masks((), lambda seen: pictures.append(_small_overlay(seen)))
     if args.sheets is not None:
         args.sheets.mkdir(parents=True, exist_ok=True)
         chosen = [pictures[int(i)] for i in np.linspace(0, len(pictures) - 1, min(24, len(pictures)))]
@@ -173,49 +259,39 @@ def _small_overlay(seen: SeenMask) -> Any:
     return cv2.resize(picture, None, fx=360 / picture.shape[1], fy=360 / picture.shape[1], interpolation=cv2.INTER_AREA)
 
 
-def cost(args: argparse.Namespace, keep: Keep) -> None:
+def cost(_args: argparse.Namespace, results: Results) -> None:
     """The masks' share of tracking, both measured in one process."""
 
     def entry() -> dict[str, Any]:
-        t = Tracked(args.data / "kitchen_walk", "none")
-        return {"mask_s": t.mask_s, "tracking_s": t.tracking_s, "share": t.mask_s / t.tracking_s}
+        t = results.poses(Task("kitchen_walk", "none"))
+        return {"mask_s": t["mask_s"], "tracking_s": t["tracking_s"], "share": t["mask_s"] / t["tracking_s"]}
 
-    keep("cost", "kitchen_walk", entry)
-
-
-def _ate(
-    args: argparse.Namespace, name: str, sequence: str, maps: Path | None = None, **options: Any
-) -> dict[str, Any]:
-    """Metrics of a whole run without a map. ``options``: start, end, semantics, dynamics (words)."""
-    config = replace(Config(), semantics="maps" if maps else options.get("semantics", "none"))
-    config = replace(config, source=replace(config.source, start=options.get("start", 0), end=options.get("end")))
-    config = replace(config, mapping=replace(config.mapping, enabled=False))
-    for words in options.get("dynamics", ()):
-        config = with_override(config, f"dynamics.{words}")
-    metrics = run(args.data / sequence, args.runs / name, config, maps=maps).metrics
-    return {k: metrics.get(k) for k in ("ate_rmse_all", "ate_rmse_keyframes", "frames_posed", "mask_iou")}
+    results.keep(("cost", "kitchen_walk"), entry)
 
 
-def twin(args: argparse.Namespace, keep: Keep) -> None:
+def twin(_args: argparse.Namespace, results: Results) -> None:
     """The same camera path with and without people in the way."""
-    keep("twin", "kitchen, clean", lambda: _ate(args, "twin-clean", "kitchen", end=240))
-    keep("twin", "kitchen_walk, no semantics", lambda: _ate(args, "twin-none", "kitchen_walk"))
-    keep("twin", "kitchen_walk, maps", lambda: _ate(args, "twin-maps", "kitchen_walk", semantics="maps"))
+    tasks = {
+        "kitchen, clean": Task("kitchen", "none", end=240),
+        "kitchen_walk, no semantics": Task("kitchen_walk", "none"),
+        "kitchen_walk, maps": Task("kitchen_walk", "maps"),
+    }
+    for name, task in tasks.items():
+        results.keep(("twin", name), lambda t=task: results.poses(t))  # type: ignore[misc]
 
 
-def off(args: argparse.Namespace, keep: Keep) -> None:
+def off(_args: argparse.Namespace, results: Results) -> None:
     """Tracking is the same for every seed, so the five trials start at five frames."""
     for start in STARTS:
-        on = {"start": start}
-        keep("off", f"masks, start {start}", lambda o=on: _ate(args, f"on-{o['start']}", "kitchen_walk", **o))  # type: ignore[misc]
-        none = {"start": start, "dynamics": ("variant=none",)}
-        keep("off", f"no masks, start {start}", lambda o=none: _ate(args, f"off-{o['start']}", "kitchen_walk", **o))  # type: ignore[misc]
+        for name, dynamics in (("masks", ()), ("no masks", ("variant=none",))):
+            task = Task("kitchen_walk", "none", start, dynamics=dynamics)
+            results.keep(("off", f"{name}, start {start}"), lambda t=task: results.poses(t))  # type: ignore[misc]
 
 
-def perfect(args: argparse.Namespace, keep: Keep) -> None:
+def perfect(_args: argparse.Namespace, results: Results) -> None:
     """The true masks as maps, believed."""
-    maps = args.data / "kitchen_walk" / "mask"
-    keep("perfect", "kitchen_walk", lambda: _ate(args, "perfect", "kitchen_walk", maps, dynamics=PERFECT))
+    task = Task("kitchen_walk", "maps", dynamics=PERFECT, maps="mask")
+    results.keep(("perfect", "kitchen_walk"), lambda: results.poses(task))
 
 
 PARTS = {"ablation": ablation, "static": static, "cost": cost, "twin": twin, "off": off, "perfect": perfect}

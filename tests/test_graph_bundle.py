@@ -282,3 +282,35 @@ def test_a_keyframe_without_matches_stays_where_it_is(exact_scene: Callable[...,
     np.testing.assert_allclose(blocks[4].cam_from_world, before, atol=1e-12)
     np.testing.assert_allclose(blocks[4].inv_depth, depth)
     assert np.isfinite(report.cost_last)
+
+
+def with_points_at_infinity(scene: Any, edges: list[Edge], far: Array, noise_px: float) -> None:
+    """Matches of the pixels ``far`` become those of points that no translation moves; all get noise."""
+    rng = np.random.default_rng(7)
+    rays = np.concatenate([(scene.px - scene.lens[2:4]) / scene.focal_px, np.ones((len(scene.px), 1))], 1)
+    for e in edges:
+        seen = rays @ scene.j_from_i(e.i, e.j)[:3, :3].T
+        e.target[far] = (scene.lens[2:4] + scene.focal_px * seen[:, :2] / seen[:, 2:])[far]
+        e.target += rng.normal(0, noise_px, e.target.shape)
+
+
+def test_points_at_infinity_neither_bend_the_lens_nor_stop_the_solver(exact_scene: Callable[..., Any]) -> None:
+    """Noise asks half of them to be further than infinity: from both sides the same lens is found, and the right one.
+
+    Where an inverse depth can only be positive, poses and lens count on it to move and no step is good.
+    """
+    scene = exact_scene(VIEWS, step=0.2, cell_px=12)
+    far = np.random.default_rng(3).random(len(scene.px)) < 0.7
+    found, costs = [], []
+    for focal_error in (1.15, 0.9):
+        blocks, lens, edges = blocks_of(scene), lens_of(scene, focal_error), edges_of(scene)
+        with_points_at_infinity(scene, edges, far, 0.5)
+        for b in blocks.values():
+            b.inv_depth[far] = b.prior_depth[far] = 1e-6
+        report = solve(blocks, edges, lens, fixed=frozenset([0]), iterations=60, tolerance=1e-5)
+        assert report.converged
+        assert all((b.inv_depth > 0).all() for b in blocks.values())
+        found.append(float(np.exp(lens.g[0])))
+        costs.append(report.cost_last)
+    assert found == pytest.approx([scene.focal_px] * 2, rel=0.003)
+    assert costs[0] == pytest.approx(costs[1], rel=1e-3)

@@ -77,7 +77,7 @@ class GraphConfig:
 
     bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
     radial_keyframes: int = 12  # keyframes before the first radial term is estimated in the window
-    lens_keyframes: int = 32  # keyframes before principal point and higher radial terms are
+    lens_keyframes: int = 48  # keyframes before principal point and higher radial terms are
     neighbours: int = 6  # previous keyframes that a new one is matched with
     covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with
     window: int = 8  # keyframes that move in the windowed optimisation

@@ -20,6 +20,8 @@ from ..geometry.se3 import adjoint, inverse, se3_exp
 
 Array = NDArray[Any]
 T = TypeVar("T")
+AT_INFINITY = 1e-6  # of a host's typical inverse depth: that of a point further away than infinity once all is solved
+STEP_AT_INFINITY = 0.1  # of the same: as far as one step moves a point there, on either side
 _BESIDE = ThreadPoolExecutor(1, "hosts")
 
 
@@ -93,7 +95,8 @@ def solve(
     """Optimise in place. Poses in ``fixed`` stay; every host's depths and the free intrinsics move.
 
     Stops when the relative decrease of the robust cost is below ``tolerance``. A singular system or an
-    exhausted damping ends the loop with ``converged=False``.
+    exhausted damping ends the loop with ``converged=False``. Meanwhile inverse depths may fall below 0: noise moves
+    points at infinity to both sides, and where they may go to one only, the lens makes up for it, or no step is good.
     """
     by_host: dict[int, list[Edge]] = {}
     for edge in edges:
@@ -126,7 +129,14 @@ def solve(
             converged, cost = True, trial
             break
         cost = trial
+    for i in by_host:
+        depth = blocks[i].inv_depth
+        blocks[i].inv_depth = np.maximum(depth, AT_INFINITY * _typical(depth))
     return SolveReport(done, converged, cost_first, cost, sigma)
+
+
+def _typical(inv_depth: Array) -> float:
+    return float(np.abs(inv_depth).mean())
 
 
 def _gather(blocks: dict[int, Block], edges: list[Edge]) -> tuple[Array, Array, Array]:
@@ -234,7 +244,8 @@ def _apply(
         local = np.where(host.columns >= 0, step[host.columns], 0.0)
         delta = (host.bd - host.cross @ local) / host.hdd
         depth = blocks[i].inv_depth
-        blocks[i].inv_depth = np.clip(depth + delta, 0.25 * depth, 4.0 * depth + 1e-3)
+        least = STEP_AT_INFINITY * _typical(depth)
+        blocks[i].inv_depth = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
     return saved
 
 
