@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mastd3r.config import Config, SourceConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
+from mastd3r.export.machine import machine_info
 from mastd3r.finish import final_frames, finish_graph, trajectory_of
 from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import build_parts
@@ -117,7 +118,9 @@ def main() -> None:
     source = open_source(args.data, SourceConfig(), want_depth=False, want_semantic=False, semantic_dir=None)
     results = json.loads(args.out.read_text()) if args.out.exists() else {}
     for what in args.what:
-        results[what] = {"sequence": args.data.name, **measure(source, what, Config())}
+        info = machine_info()
+        made = {"date": time.strftime("%Y-%m-%d"), "commit": info["git_commit"], "processor": info["processor"]}
+        results[what] = {"sequence": args.data.name, **measure(source, what, Config()), "made": made}
         args.out.parent.mkdir(parents=True, exist_ok=True)
         args.out.write_text(json.dumps(results, indent=1) + "\n")
         print(what, json.dumps(results[what]), flush=True)

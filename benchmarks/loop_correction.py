@@ -5,7 +5,8 @@
 kitchen is tracked once with default options. Then its keyframes, cloud and views are bent as drift would: keyframe k
 of n is pushed aside by 5 cm * k / (n - 1), with truth's scale. The map is trained on that. The correction puts every
 keyframe back (Mapper.move_keyframes), nothing restarts. Figures: PSNR of the holdout frames before, right after, and
-after a few more steps; and, for comparison, what the same poses show where the map does not follow.
+after a few more steps; the same from the tracked poses alone, without what the map has learned of the poses of the
+views around; and, for comparison, what the corrected poses show where the map does not follow.
 """
 
 from __future__ import annotations
@@ -61,15 +62,26 @@ def bent(given: MapMaterial, drift: dict[int, np.ndarray]) -> MapMaterial:
     return replace(given, cloud=cloud, seen=replace(given.seen, views=views))
 
 
-def quality(mapper: Mapper, given: MapMaterial, drift: dict[int, np.ndarray], pictures: Pictures) -> float:
-    """Mean PSNR of the holdout frames from where their keyframes are."""
+def quality(
+    mapper: Mapper, given: MapMaterial, drift: dict[int, np.ndarray], pictures: Pictures, *, refined: bool = True
+) -> float:
+    """Mean PSNR of the holdout frames from where their keyframes are; ``refined``: under the map's pose corrections."""
     figures = []
+    mapper = mapper if refined else with_tracked_poses(mapper)
     for place in given.seen.holdout:
         if np.isfinite(place.world_from_cam).all():
             pose, time_s = drift[place.record.kf_id] @ place.world_from_cam, place.record.timestamp_s
             drawn = given.lens_view.as_photograph(mapper.render(pose, given.lens_view.pinhole, time_s)[0])
             figures.append(psnr(drawn.clip(0, 1), pictures[round(time_s, 6)][0]))
     return float(np.mean([f for f in figures if f is not None]))
+
+
+def with_tracked_poses(mapper: Mapper) -> Mapper:
+    """A copy that only draws, and corrects no pose. It shares everything else with ``mapper``."""
+    other = copy(mapper)
+    other._view_parameters = copy(mapper._view_parameters)
+    other._view_parameters._refine_poses = False
+    return other
 
 
 def by_anchors(mapper: Mapper, drift: dict[int, np.ndarray], right: dict[int, np.ndarray]) -> Mapper:
@@ -108,12 +120,14 @@ def main() -> int:
     mapper = Mapper(config, drifted.cloud, drifted.seen.views, 0)
     mapper.refine(args.iterations)
     figures = {"before_db": quality(mapper, given, drift, pictures)}
+    figures["before_tracked_db"] = quality(mapper, given, drift, pictures, refined=False)
     figures["map_left_behind_db"] = quality(mapper, given, right, pictures)
     figures["anchors_only_db"] = quality(by_anchors(mapper, drift, right), given, right, pictures)
     began = time.perf_counter()
     mapper.move_keyframes(drift, right)
     figures["correction_s"] = round(time.perf_counter() - began, 2)
     figures["after_db"] = quality(mapper, given, right, pictures)
+    figures["after_tracked_db"] = quality(mapper, given, right, pictures, refined=False)
     refined, done = {}, 0
     for steps in sorted(args.after):
         mapper.refine(steps - done)

@@ -65,6 +65,9 @@ def loop_correction(path: Path) -> list[str]:
     out += ["", "| holdout PSNR | dB |", "|---|---|", f"| before the correction | {e['before_db']:.2f} |"]
     out.append(f"| right after it | {e['after_db']:.2f} |")
     out += [f"| {steps} steps later | {figure:.2f} |" for steps, figure in e["refined_db"].items()]
+    if "after_tracked_db" in e:
+        out.append(f"| before, from tracked poses without the map's corrections | {e['before_tracked_db']:.2f} |")
+        out.append(f"| right after, from tracked poses without them | {e['after_tracked_db']:.2f} |")
     out.append(f"| right after it, every Gaussian with its anchor alone | {e['anchors_only_db']:.2f} |")
     out.append(f"| corrected poses, map left behind | {e['map_left_behind_db']:.2f} |")
     return out

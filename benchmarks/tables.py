@@ -109,8 +109,8 @@ def endurance(path: Path) -> list[str]:
     out = ["", "## Loops, blackouts, long runs", "", "By `python benchmarks/endurance.py --data SEQUENCE --what"]
     out[-1] += f" {' '.join(entries)} --out {path.as_posix()}`. Time is processor time of all threads."
     out += ["", "| run | frames | states | ATE all [m] | end from start [m] | keyframes at each quarter |"]
-    out[-1] += " s a frame, each quarter | memory at each quarter [MiB] |"
-    out.append("|---" * 8 + "|")
+    out[-1] += " s a frame, each quarter | memory at each quarter [MiB] | date | commit | processor |"
+    out.append("|---" * 11 + "|")
     for name, e in entries.items():
         states = ", ".join(f"{n} {s}" for s, n in e["states"].items())
         times = ", ".join(f"{t:.3f}" for t in e["cpu_s_per_frame_by_quarter"])
@@ -118,6 +118,7 @@ def endurance(path: Path) -> list[str]:
         grown = ", ".join(map(str, e["keyframes_at_quarters"]))
         memory = ", ".join(map(str, e["memory_mib_at_quarters"]))
         cells = [f"{e['sequence']}, {name}", e["frames"], states, f"{e['ate_rmse_all']:.4f}", end, grown, times, memory]
+        cells += [e["made"][key] for key in ("date", "commit", "processor")]
         out.append("| " + " | ".join(map(str, cells)) + " |")
     return out
 

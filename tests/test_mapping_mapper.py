@@ -200,6 +200,18 @@ def test_a_room_that_was_bent_by_5_cm_is_straight_again(truth: GaussianMap, monk
     assert after > before - 0.5 and after > by_anchors + 1
 
 
+def test_a_correction_counts_from_the_cameras_that_the_map_was_trained_with(truth: GaussianMap) -> None:
+    """Pose refinement has put the drifted cameras right already: the Gaussians are where they belong and stay there."""
+    bent = Bent(truth, 0.0, 0.05)
+    before, poses = bent.mapper.gaussians.means.copy(), bent.mapper._view_parameters
+    for n in range(12):
+        back = pose(n)[:3, :3].T @ bent.drift[n % 3][:3, 3]
+        poses.correct(n, back / bent.mapper._depth, np.zeros(3))
+    bent.mapper.move_keyframes(bent.drift, bent.straight)
+    moved = np.linalg.norm(bent.mapper.gaussians.means - before, axis=1)
+    assert np.median(moved) < 0.005
+
+
 def test_paper_loss_trains_too(truth: GaussianMap) -> None:
     mapper = trained([view(truth, i) for i in range(12)], paper_loss=True, hard_weight=True)
     assert holdout_psnr(mapper, truth) > 22

@@ -1,7 +1,9 @@
 """A graph correction that bends the world: a Gaussian follows all keyframes that see it, not its anchor alone.
 
 Training has put a Gaussian where the views that see it agree best. Where those hang on keyframes that had drifted
-apart, that is between them; so its motion is theirs, averaged.
+apart, that is between them; so its motion is theirs, averaged. What a view says is counted from the camera that it was
+trained with, which pose refinement had already moved some of the way. And where the poses of views were refined, they
+are fitted anew to the Gaussians where they are now, so that every view shows what it showed.
 """
 
 from __future__ import annotations
@@ -12,18 +14,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..geometry.se3 import inverse
 from .gaussians import Array, GaussianMap, quaternion_from_rotation, quaternion_product
 
 RAY_SHARE = 0.2  # what a view says of depth, as a share of what it says across its ray
 ANCHOR_PX = 1.0  # the anchor counts as a view in which the Gaussian covers this many pixels
+FIT_POINTS = 4000  # Gaussians that a view's pose is fitted to, those that make up most of its picture
+FIT_PRIOR = 0.3  # holds a pose correction near none: mean square error in the image per (shift / depth)², per turn²
 
 
 @dataclass(frozen=True)
 class Sight:
-    """How much of one view's picture each Gaussian makes up."""
+    """How much of one view's picture each Gaussian makes up, and what the correction does to what it shows."""
 
-    kf_id: int  # keyframe that the view hangs on
-    centre: Array  # (3,) of the camera, before the correction
+    change: Array  # (4, 4) new_world_from_old_world, a similarity
+    cam_from_world: Array  # (4, 4) that the view was trained with, before the correction
     weight_px: torch.Tensor  # (n,) sum of blending weights over the pixels
 
 
@@ -44,7 +49,7 @@ def bend(changes: Iterable[Array], point: Array) -> float:
 
 def sight(
     gaussians: GaussianMap,
-    kf_id: int,
+    change: Array,
     cam_from_world: torch.Tensor,
     intrinsics: torch.Tensor,
     pixel_weight: torch.Tensor,
@@ -59,12 +64,11 @@ def sight(
     height, width = pixel_weight.shape
     color, _, _ = plain.draw(cam_from_world.detach(), intrinsics, width, height, near)
     (weight_px,) = torch.autograd.grad((color[..., 0] * pixel_weight).sum(), colors)
-    centre = np.linalg.inv(cam_from_world.detach().cpu().numpy())[:3, 3]
-    return Sight(kf_id, centre, weight_px[:, 0].detach())
+    return Sight(change, cam_from_world.detach().cpu().numpy(), weight_px[:, 0].detach())
 
 
 def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable[Sight]) -> GaussianMap:
-    """The map after a correction, each Gaussian moved by the mean of what its sights' keyframes do.
+    """The map after a correction, each Gaussian moved by the mean of what its sights say.
 
     Its centre: least squares over the views, where a view counts by its pixels, and along its ray only by
     ``RAY_SHARE``, because it hardly tells depth. Its turn and its scale: the mean by pixels. What no view sees moves
@@ -81,9 +85,9 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable
     turn, log_scale = ANCHOR_PX * anchor_turn, ANCHOR_PX * anchor_scale
     pixels = torch.full((len(before),), ANCHOR_PX, dtype=torch.float64, device=device)
     for seen in sights:
-        change, weight = changes.get(seen.kf_id, np.eye(4)), seen.weight_px.double()
+        change, weight, centre_ = seen.change, seen.weight_px.double(), inverse(seen.cam_from_world)[:3, 3]
         linear, offset, centre = (
-            torch.from_numpy(np.array(a, float)).to(device) for a in (change[:3, :3], change[:3, 3], seen.centre)
+            torch.from_numpy(np.array(a, float)).to(device) for a in (change[:3, :3], change[:3, 3], centre_)
         )
         ray = torch.nn.functional.normalize(before - centre, dim=1)
         across = (1 + RAY_SHARE) * eye - ray[:, :, None] * ray[:, None, :]
@@ -101,6 +105,33 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable
     log_scales = gaussians.log_scales.detach() + (log_scale / pixels)[:, None].to(gaussians.log_scales)
     leaves = {"means": means.to(gaussians.means), "quats": quats.to(gaussians.quats), "log_scales": log_scales}
     return replace(anchored, **{name: tensor.requires_grad_() for name, tensor in leaves.items()})
+
+
+def fitted_pose(before_cam: Array, after_cam: Array, weight: Array, depth: float) -> tuple[Array, Array]:
+    """Shift (3,) in units of ``depth`` and turn (3,) of a camera, that show a moved map as the old one was shown.
+
+    before_cam (n, 3): points in the camera that the view was trained with, after_cam (n, 3): where they are now, in
+    the camera that is to be corrected, weight (n,): pixels. The correction acts on the left of cam_from_world. One
+    step of weighted least squares in the image, with a prior, because a shift aside and a turn look much alike. Zero
+    where hardly a point is in front of both cameras.
+    """
+    rows = np.argsort(-weight, kind="stable")[:FIT_POINTS]
+    rows = rows[(weight[rows] > 0) & (before_cam[rows, 2] > 0.05 * depth) & (after_cam[rows, 2] > 0.05 * depth)]
+    if len(rows) < 8:
+        return np.zeros(3), np.zeros(3)
+    (x, y, z), share = after_cam[rows].T, weight[rows] / weight[rows].sum()
+    u, v, zero = x / z, y / z, np.zeros(len(rows))
+    jacobian = np.stack(
+        [
+            np.stack([depth / z, zero, -depth * u / z, -u * v, 1 + u * u, -v], 1),
+            np.stack([zero, depth / z, -depth * v / z, -1 - v * v, u * v, u], 1),
+        ],
+        1,
+    )
+    error = before_cam[rows, :2] / before_cam[rows, 2:] - np.stack([u, v], 1)
+    normal = np.einsum("n,nki,nkj->ij", share, jacobian, jacobian) + FIT_PRIOR * np.eye(6)
+    found = np.linalg.solve(normal, np.einsum("n,nki,nk->i", share, jacobian, error))
+    return found[:3], found[3:]
 
 
 def _turn_and_scale(change: Array) -> tuple[Array, float]:

@@ -49,6 +49,15 @@ class ViewParameters:
         start, row = self._cam_from_world[number], self._rows[number]
         return self._motion(row["shift"], row["turn"]) @ start if self._refine_poses else start
 
+    def tracked_cam_from_world(self, number: int) -> Array:
+        """(4, 4) of one training view, without its correction."""
+        return self._cam_from_world[number].numpy()
+
+    def correct(self, number: int, shift: Array, turn: Array) -> None:
+        """Put a pose correction in place of what was learned."""
+        for name, value in (("shift", shift), ("turn", turn)):
+            self._rows[number][name].data.copy_(torch.from_numpy(np.asarray(value, np.float32)))
+
     def exposed(self, color: torch.Tensor, number: int) -> torch.Tensor:
         """Colour as that view's exposure shows it: gain * colour + bias."""
         if not self._exposure:
