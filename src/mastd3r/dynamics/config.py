@@ -55,7 +55,7 @@ class DynamicsConfig:
     semantic_contrast: float = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
     doubt_tolerance: float = 1.0  # times that the majority's squared misfit may exceed what is claimed
     chroma_gain: float = 1.5  # a step of colour against one of grey, for outlines
-    fine_px: float = 8.0  # reach of the last step at full size, where there is colour
+    fine_px: float = 24.0  # reach of the last step at full size, where there is colour
     fine_contrast: float = 12.0  # grey levels that are as far as fine_px
     map_contrast: float = 20.0  # the same once a semantic map is joined, whose own outlines are coarse
     edge_px: int = 8  # radius of the last step, which brings masks to the image's edges
