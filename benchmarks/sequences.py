@@ -24,8 +24,10 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "kitchen_walk": ("kitchen_walk", []),
     "kitchen_walk, no semantics": ("kitchen_walk", ["--semantics", "none", "--no-map"]),
     "kitchen_walk_close": ("kitchen_walk_close", ["--no-map"]),
+    "kitchen_walk_close, no semantics": ("kitchen_walk_close", ["--semantics", "none", "--no-map"]),
     "lobby": ("lobby", ["--no-map"]),
     "lobby_walk": ("lobby_walk", ["--no-map"]),
+    "lobby_walk, no semantics": ("lobby_walk", ["--semantics", "none", "--no-map"]),
     "jam": ("jam", ["--no-map"]),
     "tsukuba": ("tsukuba", ["--no-map"]),
     "street, map": ("street", []),
@@ -36,6 +38,7 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "bedroom": ("bedroom", ["--no-map"]),
     "cafe": ("cafe", ["--no-map"]),
     "car": ("car", ["--no-map"]),
+    "car, no semantics": ("car", ["--semantics", "none", "--no-map"]),
 }
 
 
