@@ -51,7 +51,7 @@ def _poses(found: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
     groups: dict[str, list[dict[str, Any]]] = {}
     for part in ("twin", "off", "perfect"):
         for name, e in found.get(part, {}).items():
-            groups.setdefault(name.split(", start")[0] if part != "perfect" else "the true masks given", []).append(e)
+            groups.setdefault(name.split(", start")[0], []).append(e)
     if groups:
         out += ["", "| kitchen_walk | ATE all [m], mean over starts (least–most) | starts |", "|---|---|---|"]
     for name, entries in groups.items():
