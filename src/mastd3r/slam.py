@@ -84,6 +84,7 @@ class Slam:
         self._last: tuple[WorkFrame, Later[Array]] | None = None  # last tracked frame and its P(moving)
         self._cam_from_ref = np.eye(4)  # of the last tracked frame
         self._most_matched = 0  # by any frame since ref was chosen
+        self._keyframe_at = 0  # records there were when the newest keyframe was made
 
     def near(self) -> Near:
         """What the frame after the next is probably seen beside: the keyframe that is followed now."""
@@ -305,7 +306,10 @@ class Slam:
         """Tie a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
         graph = self.graph
         everything = len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256)
-        if self.parts.provider.side_by_side and not (graph.window_is_all or everything or len(graph.started) > 1):
+        hurry = len(graph.records) - self._keyframe_at < TIED_AFTER  # the next may come before they are made
+        self._keyframe_at = len(graph.records)
+        alone = graph.window_is_all or everything or hurry or len(graph.started) > 1
+        if self.parts.provider.side_by_side and not alone:
             graph.solve_depths(kf.id)
             aside = graph.aside()
             later = self._tying.later(lambda: self.links.tie(aside, kf, before))
