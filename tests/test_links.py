@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from mastd3r.graph.keyframe_graph import Keyframe, KeyframeGraph
 from mastd3r.links import Links
 from mastd3r.pointmap.geometric import GeometricPointmaps
+from mastd3r.slam import TIED_AFTER
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.types import WorkFrame
+from test_chain import turning_fast
 from test_graph_keyframes import graph_of
 from test_submaps import Played, play, views_of
 
@@ -56,6 +58,14 @@ def test_the_result_does_not_depend_on_how_long_ties_take(
     assert quick == slow and sum(thread.startswith("ties") for _, thread in slow) >= 2
     np.testing.assert_array_equal(poses(first), poses(second))
     assert {(e.i, e.j) for e in first.slam.graph.edges} == {(e.i, e.j) for e in second.slam.graph.edges}
+
+
+def test_where_keyframes_follow_one_another_they_are_tied_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    ties = watched(monkeypatch, 0.0)
+    run = play(views_of(36, turning_fast))
+    made = {r.kf_id: r.index for r in run.slam.graph.records if r.is_keyframe}
+    hurried = [thread for k, thread in ties if made[k] - made[k - 1] < TIED_AFTER and k >= run.slam.config.graph.window]
+    assert len(hurried) >= 4 and not any(thread.startswith("ties") for thread in hurried)
 
 
 def test_a_provider_that_serves_one_at_a_time_is_asked_in_turn(
