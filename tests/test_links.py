@@ -85,6 +85,24 @@ def test_a_provider_that_serves_one_at_a_time_is_asked_in_turn(
     assert run.ate_ratio(np.ones(40, bool)) < 0.005
 
 
+def test_many_pairs_at_once_are_the_pairs_one_by_one(
+    room: list[SyntheticView], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = play(room[:40])
+    graph, links = run.slam.graph, run.slam.links
+    pairs, known = [(0, 4), (1, 6), (0, 7), (2, 5)], len(graph.edges)
+    one_by_one = sum([links.both(graph, i, j) for i, j in pairs])
+    expected, graph.edges = graph.edges[known:], graph.edges[:known]
+    for side_by_side in (True, False):
+        monkeypatch.setattr(GeometricPointmaps, "side_by_side", side_by_side)
+        assert links.many(graph, pairs) == one_by_one >= 2
+        made, graph.edges = graph.edges[known:], graph.edges[:known]
+        assert [(e.i, e.j) for e in made] == [(e.i, e.j) for e in expected]
+        for a, b in zip(made, expected, strict=True):
+            np.testing.assert_array_equal(a.target, b.target)
+            np.testing.assert_array_equal(a.weight, b.weight)
+
+
 def test_a_graph_is_solved_aside_and_taken(exact_scene: Callable[..., Any]) -> None:
     graph = graph_of(exact_scene(6), 6, noise_px=0.2, solved=True)
     before = [b.cam_from_world.copy() for b in graph.blocks.values()]

@@ -120,9 +120,9 @@ def test_pairs_that_see_the_same_are_matched_once(scene: Any) -> None:
     graph, _ = drifted(scene, scale=1.0)
     asked: list[tuple[int, int]] = []
 
-    def connect(i: int, j: int) -> bool:
-        asked.append((i, j))
-        return i != 0
+    def connect(pairs: list[tuple[int, int]]) -> int:
+        asked.extend(pairs)
+        return sum(i != 0 for i, _ in pairs)
 
     made = widen(graph, connect)
     assert made == sum(i != 0 for i, _ in asked) > 0

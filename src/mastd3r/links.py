@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from numpy.typing import NDArray
 
 from .config import GraphConfig
+from .graph.bundle import Edge
 from .graph.keyframe_graph import Keyframe, KeyframeGraph
 from .graph.places import covisible
 from .parts import Parts
@@ -47,6 +50,34 @@ class Links:
 
     def both(self, graph: KeyframeGraph, i: int, j: int) -> bool:
         """Edges both ways; False where one fails, or where nothing says how to start."""
+        found = self._found(graph, i, j)
+        graph.edges += found
+        return len(found) == 2
+
+    def many(self, graph: KeyframeGraph, pairs: Sequence[tuple[int, int]]) -> int:
+        """``both`` of many pairs, in this order; how many have edges both ways. ``graph`` has poses."""
+
+        def search(pair: tuple[int, int]) -> list[Edge]:
+            return self._found(graph, *pair)
+
+        if self.parts.provider.side_by_side:
+            with ThreadPoolExecutor(2, "pairs") as pool:
+                found = list(pool.map(search, pairs))
+        else:
+            found = [search(pair) for pair in pairs]
+        for edges in found:
+            graph.edges += edges
+        return sum(len(edges) == 2 for edges in found)
+
+    def one(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
+        """The edge of i's pixels in j, searched from ``flow`` (h, w, 2)."""
+        edge = self._edge(graph, i, j, flow)
+        if edge is not None:
+            graph.edges.append(edge)
+        return edge is not None
+
+    def _found(self, graph: KeyframeGraph, i: int, j: int) -> list[Edge]:
+        """Edges both ways, not yet added; the way back is searched where there is one there."""
         grid_px = self.parts.grid_px
         if graph.initialised:
             start, back = rigid_flow(graph, i, j), rigid_flow(graph, j, i)
@@ -54,14 +85,17 @@ class Links:
             start = chained_flow(self.flows[i, j - 1], self.flows[j - 1, j], grid_px)
             back = invert_flow(start, grid_px)
         else:
-            return False
-        return self.one(graph, i, j, start) and self.one(graph, j, i, back)
+            return []
+        there = self._edge(graph, i, j, start)
+        if there is None:
+            return []
+        again = self._edge(graph, j, i, back)
+        return [there] if again is None else [there, again]
 
-    def one(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
-        """The edge of i's pixels in j, searched from ``flow`` (h, w, 2)."""
+    def _edge(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> Edge | None:
         ref, new = graph.keyframes[i], graph.keyframes[j]
         guess = Guess(graph.camera(), flow=flow, flow_is_near=graph.initialised)
         pair = self.parts.provider.predict(ref.work, new.work, guess)
         if not graph.initialised:
             self.flows[i, j] = pair.flow
-        return graph.connect(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
+        return graph.edge(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))

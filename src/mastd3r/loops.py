@@ -87,7 +87,7 @@ def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: Two
     return Loop(i, j, j_from_i, scale, float(better.weight.sum()))
 
 
-def widen(graph: KeyframeGraph, connect: Callable[[int, int], bool]) -> int:
+def widen(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
     """Match all pairs of keyframes that should see the same by their poses and were not matched before; how many.
 
     While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time ties
@@ -104,6 +104,6 @@ def widen(graph: KeyframeGraph, connect: Callable[[int, int], bool]) -> int:
             motion = max(shared[i][1][b], shared[j][1][a])
             if share >= WIDE_OVERLAP and motion <= WIDE_MOTION and frozenset((i, j)) not in done:
                 pairs.append((-share, j, i))
-    made = sum(connect(i, j) for _, i, j in sorted(pairs)[: WIDE_PAIRS * len(ids)])
+    made = connect([(i, j) for _, i, j in sorted(pairs)[: WIDE_PAIRS * len(ids)]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made

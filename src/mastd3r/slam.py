@@ -208,7 +208,7 @@ class Slam:
         for submap in sorted(graph.started):
             graph.submap = submap
             close_loops(self.comparer, graph, self.parts.places)
-            widen(graph, lambda i, j: self.links.both(graph, i, j))
+            widen(graph, lambda pairs: self.links.many(graph, pairs))
 
     # -- keyframes -------------------------------------------------------------------------------------------
 

@@ -125,17 +125,23 @@ class KeyframeGraph:
         self.blocks[kf.id] = Block(work.px, inv_depth, inv_depth.copy(), prior_info, cam_from_world)
         return kf
 
-    def connect(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> bool:
-        """Add matches of i's pixels in j as an edge; False where too few survive the static weight.
+    def edge(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> Edge | None:
+        """Matches of i's pixels in j as an edge, not yet added; None where too few survive the static weight.
 
         ``followed``: the camera was tracked from i to j. Then few are enough, or the chain would come apart there.
         """
         weight = matches.weight * self.keyframes[i].static * static_new
         least = 0.0 if followed else self.config.min_match_ratio
         if (weight > 0.05).mean() < least or (weight > 0.05).sum() < 20:
-            return False
-        self.edges.append(Edge(i, j, matches.new_px, weight))
-        return True
+            return None
+        return Edge(i, j, matches.new_px, weight)
+
+    def connect(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> bool:
+        """Add an ``edge``; False where there is none."""
+        edge = self.edge(i, j, matches, static_new, followed=followed)
+        if edge is not None:
+            self.edges.append(edge)
+        return edge is not None
 
     def record(
         self,
