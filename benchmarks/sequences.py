@@ -19,6 +19,7 @@ from mastd3r.export.machine import machine_info
 # name -> (sequence folder, options)
 ENTRIES: dict[str, tuple[str, list[str]]] = {
     "kitchen": ("kitchen", []),
+    "kitchen, no map": ("kitchen", ["--no-map"]),
     "street": ("street", ["--no-map"]),
     "kitchen, depth pointmaps": ("kitchen", ["--pointmaps", "depth", "--end", "200", "--no-map"]),
     "kitchen_walk": ("kitchen_walk", []),
