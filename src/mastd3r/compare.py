@@ -50,12 +50,10 @@ class Comparer:
         known = Guess(graph.camera(), inv_depth, info, guess if started else None)
 
         def matched(start: Array | None) -> tuple[PairPrediction, Array]:
-            pair = self.parts.provider.predict(
-                ref.work, new, replace(known, flow=start)
-            )  # III-A: both, in ref's camera
-            return pair, pair.matches.weight * ref.static * static_at(
-                prior.get(), pair.matches.new_px
-            )  # (5)(6), softly
+            # III-A: both pointmaps, in ref's camera
+            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))
+            # (5)(6), softly
+            return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
         pair, weight = matched(flow)
         if near and matched_share(ref, weight) < THIN and (start := self._far_start(ref, new, prior)) is not None:
