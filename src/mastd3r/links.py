@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from numpy.typing import NDArray
@@ -12,6 +11,7 @@ from .config import GraphConfig
 from .graph.bundle import Edge
 from .graph.keyframe_graph import Keyframe, KeyframeGraph
 from .graph.places import covisible
+from .graph.two_threads import on_two_threads
 from .parts import Parts
 from .types import Guess
 from .view_depth import chained_flow, invert_flow, rigid_flow, static_at
@@ -60,11 +60,8 @@ class Links:
         def search(pair: tuple[int, int]) -> list[Edge]:
             return self._found(graph, *pair)
 
-        if self.parts.provider.side_by_side:
-            with ThreadPoolExecutor(2, "pairs") as pool:
-                found = list(pool.map(search, pairs))
-        else:
-            found = [search(pair) for pair in pairs]
+        side_by_side = self.parts.provider.side_by_side
+        found = on_two_threads(search, pairs) if side_by_side else [search(pair) for pair in pairs]
         for edges in found:
             graph.edges += edges
         return sum(len(edges) == 2 for edges in found)

@@ -6,10 +6,9 @@ has 6 rows a keyframe and 6 for the lens.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +16,11 @@ from numpy.typing import NDArray
 from ..geometry.gauss_newton import damped_solve
 from ..geometry.reprojection import N_COLS, N_GLOBAL, host_columns, host_cost, host_system
 from ..geometry.se3 import adjoint, inverse, se3_exp
+from .two_threads import on_two_threads
 
 Array = NDArray[Any]
-T = TypeVar("T")
 AT_INFINITY = 1e-6  # of a host's typical inverse depth: that of a point further away than infinity once all is solved
 STEP_AT_INFINITY = 0.1  # of the same: as far as one step moves a point there, on either side
-_BESIDE = ThreadPoolExecutor(1, "hosts")
 
 
 @dataclass
@@ -162,7 +160,7 @@ def _linearise(
     def one(i: int) -> tuple[_Host, Array, Array, float]:
         return _host_part(blocks, by_host[i], lens, row_of, lens_cols, kernel_px)
 
-    for i, (host, whole_h, whole_b, cost) in zip(by_host, _on_two_threads(one, list(by_host)), strict=True):
+    for i, (host, whole_h, whole_b, cost) in zip(by_host, on_two_threads(one, list(by_host)), strict=True):
         total += cost
         hosts[i] = host
         # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
@@ -194,15 +192,6 @@ def _host_part(
     local_h, local_b, cross = _host_local(h, b, e, j_from_i)
     columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
     return _Host(columns, cross, hdd_i, bd_i), local_h, local_b, float(cost.sum())
-
-
-def _on_two_threads(make: Callable[[int], T], hosts: list[int]) -> list[T]:
-    """``make`` of every host, in order; every other one is made in a thread beside."""
-    beside = _BESIDE.submit(lambda: [make(i) for i in hosts[1::2]])
-    here = [make(i) for i in hosts[::2]]
-    out: list[Any] = [None] * len(hosts)
-    out[::2], out[1::2] = here, beside.result()
-    return out
 
 
 def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
@@ -270,4 +259,4 @@ def _cost(blocks: dict[int, Block], by_host: dict[int, list[Edge]], lens: Lens, 
         block = blocks[i]
         return float(host_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.g, kernel_px).sum())
 
-    return _prior_cost(blocks, by_host, lens) + sum(_on_two_threads(one, list(by_host)))
+    return _prior_cost(blocks, by_host, lens) + sum(on_two_threads(one, list(by_host)))
