@@ -77,14 +77,14 @@ class Slam:
         self._mask = Beside("mask")  # the belief lives in its thread: it is updated while the next frame is matched
         self.links = Links(config.graph, parts)
         self._tying = Beside("ties")
-        self._tied: tuple[int, Later[KeyframeGraph]] | None = None  # after how many records it is taken, and the graph
+        self._tied: Later[KeyframeGraph] | None = None  # the graph with the newest keyframe's ties, not yet taken
         self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
         self._before_loss: Keyframe | None = None  # the same, when the camera was lost
         self._flow: Array | None = None  # ref -> last frame
         self._last: tuple[WorkFrame, Later[Array]] | None = None  # last tracked frame and its P(moving)
         self._cam_from_ref = np.eye(4)  # of the last tracked frame
         self._most_matched = 0  # by any frame since ref was chosen
-        self._keyframe_at = 0  # records there were when the newest keyframe was made
+        self._keyframe_at = 0  # records there were when the newest keyframe was tied
 
     def near(self) -> Near:
         """What the frame after the next is probably seen beside: the keyframe that is followed now."""
@@ -93,7 +93,7 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
-        if self._tied is not None and len(self.graph.records) >= self._tied[0]:
+        if len(self.graph.records) - self._keyframe_at >= TIED_AFTER:
             self._settle()
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
@@ -312,8 +312,7 @@ class Slam:
         if self.parts.provider.side_by_side and not alone:
             graph.solve_depths(kf.id)
             aside = graph.aside()
-            later = self._tying.later(lambda: self.links.tie(aside, kf, before))
-            self._tied = (len(graph.records) + TIED_AFTER, later)
+            self._tied = self._tying.later(lambda: self.links.tie(aside, kf, before))
             return
         self.links.tie(graph, kf, before)
         if not (len(graph.started) > 1 and self._joins(kf)) and everything:
@@ -322,7 +321,7 @@ class Slam:
     def _settle(self) -> None:
         """Wait for the ties of the newest keyframe, and take them into the graph."""
         if self._tied is not None:
-            tied, self._tied = self._tied[1], None
+            tied, self._tied = self._tied, None
             self.graph.take(tied.get())
 
     def _joins(self, kf: Keyframe) -> bool:
