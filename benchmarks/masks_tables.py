@@ -14,8 +14,10 @@ def masks(path: Path) -> list[str]:
     found: dict[str, dict[str, dict[str, Any]]] = json.loads(path.read_text())
     out = ["", "## Masks", ""]
     out += [f"By `python benchmarks/masks.py --data DATA --out {path.as_posix()}`. IoU at P > 0.5, mean over frames in"]
+    ends = [v["frames"] for e in found.get("ablation", {}).values() for v in e.values() if "frames" in v]
+    most = max((last - first for first, last in ends), default=0)
     out += ["which at least 1 % of the pixels move; in brackets, pixels called moving that are not. Variants are"]
-    out += ["compared on 48 frames in the middle of each sequence. Commits and dates are in the file."]
+    out += [f"compared on {most} frames in the middle of each sequence. Commits and dates are in the file."]
     return [*out, *_ablation(found.get("ablation", {})), *_static(found.get("static", {})), *_poses(found)]
 
 
