@@ -105,7 +105,7 @@ def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:
     graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
     p = len(scene.px)
     graph.add_keyframe(scene.work_frame(0), np.ones(p), np.zeros((240, 320)), np.eye(4), np.ones(p), np.ones(p))
-    with pytest.raises(InputError, match=r"camera never moves enough: expected .* 6% .*, got 1 view"):
+    with pytest.raises(InputError, match=r"camera never moves enough: expected .* 5% .*, got 1 view"):
         finish_graph(graph, Config())
 
 

@@ -84,6 +84,23 @@ def test_bootstrap_from_nothing(exact_scene: Callable[..., Any], focal_px: float
         assert np.median(np.abs(ratio - 1)) < 0.06
 
 
+def test_bootstrap_leaves_out_what_moves_by_itself(exact_scene: Callable[..., Any]) -> None:
+    """A fifth of the picture drifts across it, each of its matches in step with the others; nothing says so."""
+    scene = exact_scene(5, step=0.15, focal_px=280.0, cell_px=8)
+    graph = graph_of(scene, 5, noise_px=0.2)
+    moves = (np.abs(scene.px - [120, 120]) < [42, 62]).all(1)
+    assert 0.1 < moves.mean() < 0.2
+    for e in graph.edges:
+        e.target = e.target + moves[:, None] * (e.j - e.i) * np.array([2.0, 8.0])
+    assert bootstrap(graph)
+    assert np.exp(graph.lens.g[0]) == pytest.approx(280, rel=0.05)
+    held = sum(e.weight[moves].sum() for e in graph.edges) / sum(e.weight.sum() for e in graph.edges)
+    assert held < 0.02
+    for kf in graph.keyframes:
+        assert np.mean(kf.static[moves] < 0.5) > 0.9 and np.mean(kf.static[~moves] > 0.5) > 0.97
+        assert kf.moving[120, 120] > 127 and kf.moving[20, 290] == 0
+
+
 def test_bootstrap_with_a_given_lens_keeps_it(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(5, step=0.2, focal_px=260.0)
     given = CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5))

@@ -29,7 +29,9 @@ class TwoView:
     pair: PairPrediction
     weight: Array  # (p,) static weight of each match
     alignment: Alignment
-    motion_ratio: float  # upper quartile of the image motion / sqrt(width * height)
+    motion_ratio: (
+        float  # image motion of the matches / sqrt(width * height): the upper quartile, before a start the median
+    )
     matched: int  # weighted matches
 
 
@@ -65,7 +67,9 @@ class Comparer:
             alignment = align(pair, matches, guess, self.config.correction, self.config.alignment, sigma)  # III-B
         else:
             alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
-        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size))
+        # before a start nothing tells what moves, and what passes in front would make the keyframes
+        share = 0.75 if started else 0.5
+        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size, share))
 
     def believed(self, view: TwoView) -> bool:
         """Enough static matches, and enough of them agree on the pose."""
@@ -98,9 +102,9 @@ def matched_share(ref: Keyframe, weight: Array) -> float:
     return int((weight > 0.05).sum()) / max(int((ref.work.texture * ref.static > 0.05).sum()), 1)
 
 
-def _motion(matches: Matches, weight: Array, size: tuple[int, int]) -> tuple[float, int]:
+def _motion(matches: Matches, weight: Array, size: tuple[int, int], share: float) -> tuple[float, int]:
     used = weight > 0.05
     if used.sum() < 10:
         return float("inf"), 0
     moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
-    return float(np.quantile(moved, 0.75)) / float(np.sqrt(size[0] * size[1])), int(used.sum())
+    return float(np.quantile(moved, share)) / float(np.sqrt(size[0] * size[1])), int(used.sum())

@@ -53,7 +53,7 @@ class TrackingConfig:
     area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
     cell_px: int = 10  # one matched pixel a cell of this size
     keyframe_motion_ratio: float = 0.1  # upper quartile of image motion since the keyframe / sqrt(width * height)
-    first_motion_ratio: float = 0.06  # the same before lens and structure are started
+    first_motion_ratio: float = 0.05  # the median of the same, before lens and structure are started
     keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
     known_overlap_ratio: float = 0.8  # share of an older keyframe's points in view, above: it may be used again
     known_motion_ratio: float = 0.06  # median image motion from an older keyframe / width, below: the same

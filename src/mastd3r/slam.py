@@ -193,10 +193,11 @@ class Slam:
         graph = self.graph
         if self._last is not None:
             self._last[1].get()
-        if self._last is not None and self._flow is not None and graph.initialised and self._ref is not None:
+        if self._last is not None and self._flow is not None and self._ref is not None:
             work, moving = self._last
             view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
-            enough = 0.3 * self.config.tracking.keyframe_motion_ratio
+            t = self.config.tracking
+            enough = 0.3 * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
             if self.comparer.believed(view) and view.motion_ratio > enough:
                 self._add_keyframe(work, moving, view)
         if graph.started and graph.keyframes and not graph.initialised and not bootstrap(graph):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,39 +21,44 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_AGREEMENT = 0.4  # of the matches, for a start to be believed
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
+SAME = 0.01  # starts whose focal lengths and costs differ by less came to the same end
+FITS_PX = 1.0  # a match further away counts as left out
+FOCAL_DOUBT = 0.1  # share of the matches that a focal length e times the usual one must explain more than the others
 FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the lens is not given
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Lens, poses and depths that were found from one first pair and focal length."""
+
+    cost: float
+    g: Array
+    state: dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of each keyframe
 
 
 def bootstrap(whole: KeyframeGraph) -> bool:
     """Solve all keyframes of the submap being tracked. False where no start was found (too little parallax).
 
-    Several first pairs and focal lengths are tried, each to the end; the start that explains the matches best is
-    kept. World is the submap's first keyframe's camera. A lens that an earlier submap has found stays as it is.
+    Several first pairs and focal lengths are tried, each to the end; the start that explains the most matches is
+    kept, and matches that it leaves out lose their weight: nothing else tells yet what moves. World is the submap's
+    first keyframe's camera. A lens that an earlier submap has found stays as it is.
     """
     graph = whole.part()
     if whole.started:
         graph.lens = Lens(whole.lens.g, whole.lens.g, np.full(N_GLOBAL, np.inf))
-    ratios = FOCAL_RATIOS if graph.lens.free[0] else (None,)
-    best: tuple[float, Array, dict[int, tuple[Array, Array]]] | None = None
-    for pair in _first_pairs(graph):
-        for ratio in ratios:
-            lens = Lens(graph.lens.prior.copy(), graph.lens.prior, graph.lens.prior_info)
-            if ratio is not None:
-                lens.g[0] = np.log(ratio * np.sqrt(graph.size[0] * graph.size[1]))
-            cost = _attempt(graph, lens, pair)
-            log.info("start from %d-%d: focal %.0f px, cost %s", pair.i, pair.j, np.exp(lens.g[0]), cost)
-            if cost is not None and (best is None or cost < best[0]):
-                best = (cost, lens.g, {k: (b.cam_from_world, b.inv_depth) for k, b in graph.blocks.items()})
+    best = min(_starts(graph), key=lambda start: start.cost, default=None)
     if best is None:
         return False
-    graph.lens.g = best[1]
-    world_from_first = inverse(best[2][min(best[2])][0])
-    for k, (pose, depth) in best[2].items():
+    graph.lens.g = best.g
+    world_from_first = inverse(best.state[min(best.state)][0])
+    for k, (pose, depth) in best.state.items():
         graph.blocks[k].cam_from_world, graph.blocks[k].inv_depth = pose @ world_from_first, depth
     agreeing = _agreement(graph)
     if agreeing < MIN_AGREEMENT:
         log.info("no start: only %.0f %% of the matches fit one camera and one static scene", 100 * agreeing)
         return False
+    for k, static in _without_what_is_left(graph).items():
+        whole.doubt(k, static)
     graph.normalise()
     whole.lens.g = graph.lens.g
     whole.started.add(whole.submap)
@@ -59,16 +66,79 @@ def bootstrap(whole: KeyframeGraph) -> bool:
     return True
 
 
+def _starts(graph: KeyframeGraph) -> Iterator[_Start]:
+    """Every start that comes to an end, those that come to the same one once."""
+    ratios = FOCAL_RATIOS if graph.lens.free[0] else (None,)
+    ends: list[tuple[float, float]] = []
+    for pair in _first_pairs(graph):
+        same = 0
+        for ratio in ratios:
+            lens = Lens(graph.lens.prior.copy(), graph.lens.prior, graph.lens.prior_info)
+            if ratio is not None:
+                lens.g[0] = np.log(ratio * np.sqrt(graph.size[0] * graph.size[1]))
+            cost = _attempt(graph, lens, pair)
+            if cost is None:
+                continue
+            if any(abs(lens.g[0] - f) < SAME and abs(cost - c) < SAME * c for f, c in ends):
+                same += 1
+                continue
+            ends.append((float(lens.g[0]), cost))
+            left_out = _settle_on_most(graph, lens)
+            log.info("start from %d-%d: focal %.0f px, cost %.0f", pair.i, pair.j, np.exp(lens.g[0]), left_out)
+            state = {k: (b.cam_from_world, b.inv_depth) for k, b in graph.blocks.items()}
+            yield _Start(left_out, lens.g, state)
+        if len(ends) == 1 and same == len(FOCAL_RATIOS) - 1:
+            return  # there is no other
+
+
+def _settle_on_most(graph: KeyframeGraph, lens: Lens) -> float:
+    """Solve on with the matches that fit alone, under bounds that tighten; what is left out, by weight.
+
+    Something that moves is not noise: its matches agree with one another, and a start that bends lens and poses
+    until they nearly fit is cheap under a kernel that grows without end. A focal length far from what cameras have
+    must explain more matches than one that is near.
+    """
+    for bound_px in (6.0, 4.0, 3.0, 2.0):
+        errors = zip(graph.edges, _errors_px(graph, lens), strict=True)
+        edges = [replace(e, weight=np.where(r < bound_px, e.weight, 0.0)) for e, r in errors]
+        _solve_all(graph, edges, lens, 10)
+    left_out = total = 0.0
+    for e, r in zip(graph.edges, _errors_px(graph, lens), strict=True):
+        left_out += float((e.weight * np.minimum((r / FITS_PX) ** 2, 1.0)).sum())
+        total += float(e.weight.sum())
+    unusual = (lens.g[0] - lens.prior[0]) ** 2 if lens.free[0] else 0.0
+    return left_out + FOCAL_DOUBT * total * float(unusual)
+
+
+def _errors_px(graph: KeyframeGraph, lens: Lens) -> list[Array]:
+    """(p,) distance in pixels of every match from where poses and depths put it, an array an edge."""
+    out = []
+    for e in graph.edges:
+        block = graph.blocks[e.i]
+        j_from_i = graph.blocks[e.j].cam_from_world @ inverse(block.cam_from_world)
+        residual, _ = edge_residuals(block.px, block.inv_depth, e.target, j_from_i, lens.g)
+        out.append(np.hypot(residual[:, 0], residual[:, 1]))
+    return out
+
+
+def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
+    """Matches far from the start lose their weight; (p,) share that every keyframe's points keep, 1 without any."""
+    errors = _errors_px(graph, graph.lens)
+    used = np.concatenate([r[e.weight > 0.05] for e, r in zip(graph.edges, errors, strict=True)])
+    bound_px = max(3.0, 5.0 * float(np.median(used)))  # a lens that is bent more than known moves the most
+    kept = {k: np.zeros((2, len(b.px))) for k, b in graph.blocks.items()}
+    for e, r in zip(graph.edges, errors, strict=True):
+        fits = r < bound_px
+        kept[e.i] += e.weight * np.stack([fits, np.ones(len(fits))])
+        e.weight = np.where(fits, e.weight, 0.0)
+    return {k: np.where(total > 0, fit / np.maximum(total, 1e-9), 1.0) for k, (fit, total) in kept.items()}
+
+
 def _agreement(graph: KeyframeGraph) -> float:
     """Share of all weighted matches within 2 px of where poses and depths put them."""
-    close = total = 0
-    for e in graph.edges:
-        block, used = graph.blocks[e.i], e.weight > 0.05
-        j_from_i = graph.blocks[e.j].cam_from_world @ inverse(block.cam_from_world)
-        residual, _ = edge_residuals(block.px, block.inv_depth, e.target, j_from_i, graph.lens.g)
-        close += int((np.hypot(residual[:, 0], residual[:, 1])[used] < 2.0).sum())
-        total += int(used.sum())
-    return close / max(total, 1)
+    used = [e.weight > 0.05 for e in graph.edges]
+    close = sum(int((r[u] < 2.0).sum()) for r, u in zip(_errors_px(graph, graph.lens), used, strict=True))
+    return close / max(sum(int(u.sum()) for u in used), 1)
 
 
 def _first_pairs(graph: KeyframeGraph) -> list[Edge]:
@@ -100,12 +170,17 @@ def _attempt(graph: KeyframeGraph, lens: Lens, pair: Edge) -> float | None:
         _solve_part(graph, frozen, done, frozenset(done[:-1]), 15, 4.0)
         _carry(graph, lens, nearest, k)
         _solve_part(graph, frozen, done, frozenset([pair.i]), 6, 2.0)
+    cost = _solve_all(graph, graph.edges, lens, 25)
+    return cost if np.isfinite(cost) else None
+
+
+def _solve_all(graph: KeyframeGraph, edges: Sequence[Edge], lens: Lens, iterations: int) -> float:
+    """Poses, depths and focal length; the cost."""
     only_focal = Lens(lens.g, lens.prior, np.where(np.arange(N_GLOBAL) == 0, lens.prior_info, np.inf))
-    report = solve(
-        graph.blocks, graph.edges, only_focal, fixed=frozenset([min(graph.blocks)]), iterations=25, kernel_px=1.0
-    )
+    first = frozenset([min(graph.blocks)])
+    report = solve(graph.blocks, edges, only_focal, fixed=first, iterations=iterations, kernel_px=1.0)
     lens.g = only_focal.g
-    return report.cost_last if np.isfinite(report.cost_last) else None
+    return report.cost_last
 
 
 def _solve_part(

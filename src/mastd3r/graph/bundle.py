@@ -127,10 +127,26 @@ def solve(
             converged, cost = True, trial
             break
         cost = trial
+    if len(fixed) == 1:
+        _face_scene(blocks, by_host, min(fixed))
     for i in by_host:
         depth = blocks[i].inv_depth
         blocks[i].inv_depth = np.maximum(depth, AT_INFINITY * _typical(depth))
     return SolveReport(done, converged, cost_first, cost, sigma)
+
+
+def _face_scene(blocks: dict[int, Block], by_host: dict[int, list[Edge]], still: int) -> None:
+    """Where most points ended behind their cameras: inverse depths and translations, all negated, project the same."""
+    if np.median(np.concatenate([blocks[i].inv_depth for i in by_host])) >= 0:
+        return
+    still_from_world = blocks[still].cam_from_world
+    world_from_still = inverse(still_from_world)
+    for block in blocks.values():
+        pose = block.cam_from_world @ world_from_still
+        pose[:3, 3] *= -1
+        block.cam_from_world = pose @ still_from_world
+    for i in by_host:
+        blocks[i].inv_depth = -blocks[i].inv_depth
 
 
 def _typical(inv_depth: Array) -> float:

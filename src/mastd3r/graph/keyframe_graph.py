@@ -178,6 +178,16 @@ class KeyframeGraph:
             last.index, last.timestamp_s, kf.id, np.eye(4), last.state, *_nothing(), is_keyframe=True
         )
 
+    def doubt(self, kf_id: int, static: Array) -> None:
+        """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count."""
+        kf = self.keyframes[kf_id]
+        np.minimum(kf.static, static, out=kf.static)
+        half = round(np.sqrt(kf.moving.size / len(kf.work.px)) / 2)
+        for n in np.flatnonzero(static < 0.5):
+            x, y = np.rint(kf.work.px[n]).astype(int)
+            cell = kf.moving[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
+            np.maximum(cell, np.uint8(255 * (1 - static[n])), out=cell)
+
     def start_submap(self) -> None:
         """What comes next is not connected to what is there, until it is recognised."""
         self.submap = 1 + max(self.submap_of.values(), default=-1)
