@@ -230,6 +230,16 @@ def test_noise_does_not_pull_the_lens_one_way(exact_scene: Callable[..., Any], o
     assert abs(np.mean(focal)) < 0.003 and abs(np.mean(radial)) < 0.002
 
 
+def test_without_matches_nothing_moves(exact_scene: Callable[..., Any]) -> None:
+    scene = exact_scene(VIEWS)
+    blocks = blocks_of(scene)
+    before = {k: (b.cam_from_world.copy(), b.inv_depth.copy()) for k, b in blocks.items()}
+    report = solve(blocks, [], lens_of(scene), fixed=frozenset([0]), iterations=5)
+    assert report.cost_last == 0
+    for k, b in blocks.items():
+        assert (b.cam_from_world == before[k][0]).all() and (b.inv_depth == before[k][1]).all()
+
+
 def test_a_scene_behind_the_cameras_is_turned_to_the_front(exact_scene: Callable[..., Any]) -> None:
     """Depths and translations negated explain every match as well; a solver may end there, nobody wants it to."""
     scene = exact_scene(VIEWS)

@@ -29,9 +29,7 @@ class TwoView:
     pair: PairPrediction
     weight: Array  # (p,) static weight of each match
     alignment: Alignment
-    motion_ratio: (
-        float  # image motion of the matches / sqrt(width * height): the upper quartile, before a start the median
-    )
+    motion_ratio: float  # upper quartile of the image motion, its median before a start, / sqrt(width * height)
     matched: int  # weighted matches
 
 

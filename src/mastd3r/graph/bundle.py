@@ -127,7 +127,7 @@ def solve(
             converged, cost = True, trial
             break
         cost = trial
-    if len(fixed) == 1:
+    if by_host and len(fixed) == 1:
         _face_scene(blocks, by_host, min(fixed))
     for i in by_host:
         depth = blocks[i].inv_depth
