@@ -50,8 +50,10 @@ LAYERS: dict[str, set[str]] = {
     "loops": {"geometry", *CONTRACTS, *STAGES, "view_depth", "compare", "lookahead"},
     "links": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "links", "lookahead", "loops"},
+    "late_masks": {"geometry", *CONTRACTS, *STAGES, "view_depth", "finish"},
     "second_pass": {
-        "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "rectify", "lookahead",
+        "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "late_masks", "rectify",
+        "lookahead",
     },
     "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
     "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},

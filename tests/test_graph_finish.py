@@ -15,6 +15,7 @@ from mastd3r.errors import InputError
 from mastd3r.finish import final_frames, finish_graph, static_cloud, trajectory_of
 from mastd3r.geometry.se3 import interpolate, inverse, se3_exp, se3_log
 from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
+from mastd3r.late_masks import LateMasks
 
 Array = NDArray[Any]
 KEYFRAMES = (0, 6, 12)
@@ -98,6 +99,46 @@ def test_a_run_that_never_saw_anything_has_no_pose(scene: Any) -> None:
     frames = final_frames(graph)
     assert all(f.state == "lost" and np.isnan(f.world_from_cam).all() for f in frames)
     assert trajectory_of([]).world_from_cam.shape == (0, 4, 4)
+
+
+def test_late_masks_take_what_moves_out_of_the_poses(scene: Any) -> None:
+    """A third of the picture slides, 1 px a frame: a robust kernel gives way to that, the mask does not."""
+    graph = tracked_graph(scene, set())
+    pairs = [(a, b) for a in range(3) for b in range(3) if a != b]
+    for i, j in pairs:
+        graph.connect(i, j, scene.matches(KEYFRAMES[i], KEYFRAMES[j], 0.2), np.ones(len(scene.px)))
+    moving = np.zeros((scene.height, scene.width), np.float32)
+    moving[:, : scene.width // 3] = 1.0
+    slides = scene.px[:, 0] < scene.width // 3 - 20
+    for r in graph.records:
+        if len(r.points):
+            r.target = r.target - np.float32(slides[r.points][:, None] * [r.index - KEYFRAMES[r.kf_id], 0])
+    for e in graph.edges:
+        e.target = e.target - slides[:, None] * [KEYFRAMES[e.j] - KEYFRAMES[e.i], 0]
+    truth = np.stack([world_from(scene, k) for k in range(13)])
+
+    def worst(frames: list[Any]) -> float:
+        return max(np.linalg.norm(se3_log(inverse(t) @ f.world_from_cam)) for t, f in zip(truth, frames, strict=True))
+
+    before, lens = worst(final_frames(graph)), graph.lens.g.copy()
+    late = LateMasks()
+    for r in graph.records:
+        late.see(r, moving)
+    unit = graph.blocks[0].inv_depth[~slides].mean()
+    after = worst(late.solve_again(graph))
+    assert after < 0.5 * before and after < 0.01
+    assert (graph.lens.g == lens).all()
+    assert graph.blocks[0].inv_depth[~slides].mean() == pytest.approx(unit, rel=0.01)
+    on_it = np.concatenate([r.weight[slides[r.points]] for r in graph.records])
+    off_it = np.concatenate([r.weight[scene.px[r.points, 0] > scene.width / 3 + 20] for r in graph.records])
+    assert on_it.max() < 0.03 and off_it.min() > 0.9
+
+
+def test_without_masks_the_matches_keep_their_weight(scene: Any) -> None:
+    graph = tracked_graph(scene, {4})
+    before = [r.weight.copy() for r in graph.records]
+    LateMasks().weigh(graph)
+    assert all((r.weight == w).all() for r, w in zip(graph.records, before, strict=True))
 
 
 def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:

@@ -185,6 +185,8 @@ class _Job:
         lens_view = LensView(self.lens(), self.config.mapping.width_px, self.config.mapping.tau_uncertainty_px)
         with self._timed("masks"):
             seen = self._look_again(lens_view)
+        with self._timed("poses under the masks"):
+            seen = self._solve_again(seen)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
         self.folder.write_cloud(cloud)
         return frames, MapMaterial(cloud, seen, lens_view)
@@ -285,6 +287,13 @@ class _Job:
                 return second_pass(self.source.frames(), look, on_mask)
             finally:
                 video.close()
+
+    def _solve_again(self, seen: SecondPass) -> SecondPass:
+        if not self.slam.graph.started:
+            return seen
+        self._final = seen.late.solve_again(self.slam.graph)
+        self._write_trajectory()
+        return seen.with_poses(self._final)
 
     def _map(self, cloud: StaticCloud, seen: SecondPass) -> Mapper:
         config, begun = self.config.mapping, self._begun

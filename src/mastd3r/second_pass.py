@@ -21,6 +21,7 @@ from .finish import FinalFrame
 from .geometry.se3 import inverse, transform
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.point_votes import PointVotes
+from .late_masks import LateMasks
 from .lens_view import LensView
 from .lookahead import Beside, Later, ahead
 from .parts import Parts
@@ -43,6 +44,13 @@ class SecondPass:
     colors: dict[int, Array] = field(default_factory=dict)  # kf id -> (p, 3) uint8 at its px; no holdout frame
     moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px, by all frames
     holdout: list[FinalFrame] = field(default_factory=list)
+    late: LateMasks = field(default_factory=LateMasks)  # the masks, for the poses that they were made with
+
+    def with_poses(self, final: list[FinalFrame]) -> SecondPass:
+        """The same seen from other poses."""
+        place = {f.record.timestamp_s: f for f in final}
+        views = [replace(v, world_from_cam=place[v.timestamp_s].world_from_cam) for v in self.views]
+        return replace(self, views=views, holdout=[place[f.record.timestamp_s] for f in self.holdout])
 
 
 def is_holdout(position: int) -> bool:
@@ -101,6 +109,7 @@ def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask
         for mask in belief.masks(inputs):
             one = waiting.popleft()
             place = one.place
+            out.late.see(place.record, mask.probability)
             moving = _over_photograph(mask.probability, look.rectifier)
             shown = SeenMask(place.record.timestamp_s, one.small, mask, moving)
             written.append(writer.later(partial(on_mask, shown)))

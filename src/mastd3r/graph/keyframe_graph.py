@@ -179,7 +179,10 @@ class KeyframeGraph:
         )
 
     def doubt(self, kf_id: int, static: Array) -> None:
-        """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count."""
+        """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
+
+        The frames that hang on the keyframe keep matches of these points, which count for less as well.
+        """
         kf = self.keyframes[kf_id]
         np.minimum(kf.static, static, out=kf.static)
         half = round(np.sqrt(kf.moving.size / len(kf.work.px)) / 2)
@@ -187,6 +190,9 @@ class KeyframeGraph:
             x, y = np.rint(kf.work.px[n]).astype(int)
             cell = kf.moving[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
             np.maximum(cell, np.uint8(255 * (1 - static[n])), out=cell)
+        for r in self.records:
+            if r.kf_id == kf_id:
+                r.weight = (r.weight * static[r.points]).astype(np.float32)
 
     def start_submap(self) -> None:
         """What comes next is not connected to what is there, until it is recognised."""
@@ -268,9 +274,12 @@ class KeyframeGraph:
         """True while the sliding window holds every keyframe of the submap being tracked."""
         return len(self.members()) <= self.config.window
 
-    def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
-        """Every keyframe moves but the first of each submap."""
-        lens = self._lens_with(())
+    def solve_all(self, iterations: int, kernel_px: float, *, same_frame: bool = False) -> SolveReport:
+        """Every keyframe moves but the first of each submap.
+
+        ``same_frame``: lens and unit of length stay, so that what was made with them still holds.
+        """
+        lens = self._lens_with(range(N_GLOBAL) if same_frame else ())
         report = solve(
             self.blocks,
             self.edges,
@@ -280,9 +289,10 @@ class KeyframeGraph:
             kernel_px=kernel_px,
             tolerance=1e-5,
         )
-        self.lens.g = lens.g
-        self.normalise()
-        self.last_report = report
+        if not same_frame:
+            self.lens.g = lens.g
+            self.normalise()
+            self.last_report = report
         return report
 
     def _lens_with(self, fixed: Iterable[int]) -> Lens:
