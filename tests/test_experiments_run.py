@@ -169,14 +169,14 @@ def test_an_interrupted_bench_stops_its_runs_and_records_nothing_of_them(tmp_pat
 
     began = time.monotonic()
     chosen = [e for e in entries() if e.sequence.name == "a"][:2]
-    slow = Fake(wait_s=30)
+    slow = Fake(wait_s=120)
 
     def launch(entry: Entry, folder: Path, out: Path) -> list[str]:
         return (Fake() if entry is chosen[0] else slow)(entry, folder, out)
 
     with pytest.raises(KeyboardInterrupt):
         run_entries(chosen, {"a": Path("a")}, store, Limits(2, 1000), done=interrupted, launch=launch)
-    assert time.monotonic() - began < 15 and slow.started == [chosen[1].label]
+    assert time.monotonic() - began < 60 and slow.started == [chosen[1].label]
     assert store.get(chosen[0]) is not None and store.get(chosen[1]) is None
 
 
