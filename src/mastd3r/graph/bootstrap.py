@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..geometry.reprojection import N_GLOBAL, edge_residuals
 from ..geometry.se3 import inverse
-from .bundle import Edge, Lens, solve
+from .bundle import Block, Edge, Lens, solve
 from .depth import carried
 from .keyframe_graph import KeyframeGraph, camera_of
 
@@ -59,6 +59,9 @@ def bootstrap(whole: KeyframeGraph) -> bool:
         return False
     for k, static in _without_what_is_left(graph).items():
         whole.doubt(k, static)
+    for block in graph.blocks.values():  # the last start that was tried has left its own there
+        _weak_prior(block)
+    _solve_all(graph, graph.edges, graph.lens, 5)
     graph.normalise()
     whole.lens.g = graph.lens.g
     whole.started.add(whole.submap)
@@ -222,5 +225,9 @@ def _carry(graph: KeyframeGraph, lens: Lens, i: int, j: int) -> None:
     j_from_i = b.cam_from_world @ inverse(a.cam_from_world)
     b.inv_depth, _ = carried(a.px, a.inv_depth, info, j_from_i, camera_of(lens, graph.size), b.px)
     b.inv_depth = np.clip(b.inv_depth, 1e-3, 50.0)
-    b.prior_depth = b.inv_depth.copy()
-    b.prior_info = np.full(len(b.px), 1e-3 / float(np.median(b.inv_depth)) ** 2)
+    _weak_prior(b)
+
+
+def _weak_prior(block: Block) -> None:
+    block.prior_depth = block.inv_depth.copy()
+    block.prior_info = np.full(len(block.px), 1e-3 / float(np.median(block.inv_depth)) ** 2)
