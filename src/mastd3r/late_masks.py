@@ -1,4 +1,4 @@
-"""What the masks of the second pass say of the matches that poses came from."""
+"""What the masks of the second pass say of the matches that the poses of frames came from."""
 
 from __future__ import annotations
 
@@ -28,23 +28,22 @@ class LateMasks:
         if record.is_keyframe:
             self._keyframes[record.kf_id] = np.rint(255 * moving).astype(np.uint8)
 
-    def solve_again(self, graph: KeyframeGraph) -> list[FinalFrame]:
-        """Poses and depths from the matches that the masks leave. Lens and unit stay: views were made with them."""
+    def poses(self, graph: KeyframeGraph) -> list[FinalFrame]:
+        """Every frame's pose from the matches that the masks leave.
+
+        Keyframes stay where the joint optimisation put them: their chain needs every match that it has.
+        """
         self.weigh(graph)
-        graph.solve_all(graph.config.final_iterations // 2, graph.config.kernel_px, same_frame=True)
         return final_frames(graph)
 
     def weigh(self, graph: KeyframeGraph) -> None:
-        """Every match of the graph counts by P(static) at both of its ends."""
+        """The matches that frames keep of their keyframes count by P(static) at both ends."""
         static = {k: _static(m, graph.blocks[k].px) for k, m in self._keyframes.items()}
         for r in graph.records:
             if len(r.points):
                 at_keyframe = static[r.kf_id][r.points] if r.kf_id in static else 1.0
                 at_frame = np.maximum(self._targets.get(r.index, 1.0), LEAST)
                 r.weight = (r.weight * at_frame * at_keyframe).astype(np.float32)
-        for e in graph.edges:
-            at_j = _static(self._keyframes[e.j], e.target) if e.j in self._keyframes else 1.0
-            e.weight = e.weight * static.get(e.i, 1.0) * at_j
 
 
 def _static(moving: Array, px: Array) -> Array:

@@ -186,7 +186,7 @@ class _Job:
         with self._timed("masks"):
             seen = self._look_again(lens_view)
         with self._timed("poses under the masks"):
-            seen = self._solve_again(seen)
+            seen = self._place_again(seen)
         cloud = static_cloud(self.slam.graph, seen.colors, seen.moving)
         self.folder.write_cloud(cloud)
         return frames, MapMaterial(cloud, seen, lens_view)
@@ -288,10 +288,10 @@ class _Job:
             finally:
                 video.close()
 
-    def _solve_again(self, seen: SecondPass) -> SecondPass:
+    def _place_again(self, seen: SecondPass) -> SecondPass:
         if not self.slam.graph.started:
             return seen
-        self._final = seen.late.solve_again(self.slam.graph)
+        self._final = seen.late.poses(self.slam.graph)
         self._write_trajectory()
         return seen.with_poses(self._final)
 

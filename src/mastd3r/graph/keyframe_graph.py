@@ -274,12 +274,9 @@ class KeyframeGraph:
         """True while the sliding window holds every keyframe of the submap being tracked."""
         return len(self.members()) <= self.config.window
 
-    def solve_all(self, iterations: int, kernel_px: float, *, same_frame: bool = False) -> SolveReport:
-        """Every keyframe moves but the first of each submap.
-
-        ``same_frame``: lens and unit of length stay, so that what was made with them still holds.
-        """
-        lens = self._lens_with(range(N_GLOBAL) if same_frame else ())
+    def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
+        """Every keyframe moves but the first of each submap."""
+        lens = self._lens_with(())
         report = solve(
             self.blocks,
             self.edges,
@@ -289,10 +286,9 @@ class KeyframeGraph:
             kernel_px=kernel_px,
             tolerance=1e-5,
         )
-        if not same_frame:
-            self.lens.g = lens.g
-            self.normalise()
-            self.last_report = report
+        self.lens.g = lens.g
+        self.normalise()
+        self.last_report = report
         return report
 
     def _lens_with(self, fixed: Iterable[int]) -> Lens:
