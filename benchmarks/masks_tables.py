@@ -55,10 +55,7 @@ def _poses(found: dict[str, dict[str, dict[str, Any]]]) -> list[str]:
         for name, e in found.get(part, {}).items():
             groups.setdefault(name.split(", start")[0], []).append(e)
     if groups:
-        out += [
-            "",
-            "Poses of tracking and the joint optimisation, before the final masks weigh the matches of frames once more:",
-        ]
+        out += ["", "Poses of tracking and the joint optimisation, before the final masks weigh the matches of frames:"]
         out += ["", "| kitchen_walk | ATE all [m], mean over starts (least–most) | starts |", "|---|---|---|"]
     for name, entries in groups.items():
         ate = [e["ate_rmse_all"] for e in entries]
