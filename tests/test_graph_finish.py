@@ -16,6 +16,8 @@ from mastd3r.finish import final_frames, finish_graph, static_cloud, trajectory_
 from mastd3r.geometry.se3 import interpolate, inverse, se3_exp, se3_log
 from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
 from mastd3r.late_masks import LateMasks
+from mastd3r.second_pass import SecondPass
+from mastd3r.types import View
 
 Array = NDArray[Any]
 KEYFRAMES = (0, 6, 12)
@@ -119,13 +121,27 @@ def test_late_masks_take_what_moves_out_of_the_poses(scene: Any) -> None:
     keyframes = {k: b.cam_from_world.copy() for k, b in graph.blocks.items()}
     late = LateMasks()
     for r in graph.records:
-        late.see(r, moving)
+        late.see(graph, r, moving)
     after = worst(late.poses(graph))
     assert after < 0.5 * before and after < 0.01
     assert all((graph.blocks[k].cam_from_world == pose).all() for k, pose in keyframes.items())
     on_it = np.concatenate([r.weight[slides[r.points]] for r in graph.records])
     off_it = np.concatenate([r.weight[scene.px[r.points, 0] > scene.width / 3 + 20] for r in graph.records])
     assert on_it.max() < 0.03 and off_it.min() > 0.9
+
+
+def test_views_and_holdout_take_the_new_poses(scene: Any) -> None:
+    graph = tracked_graph(scene, set())
+    old = final_frames(graph)
+    new = [replace(f, world_from_cam=f.world_from_cam @ se3_exp(np.full(6, 0.01 * n))) for n, f in enumerate(old)]
+    blank = np.ones((4, 4), np.float32)
+    views = [
+        View(f.record.timestamp_s, blank, blank, f.world_from_cam, graph.camera(), f.record.kf_id) for f in old[1:5]
+    ]
+    seen = SecondPass(views=views, holdout=[old[8], old[0]]).with_poses(new)
+    assert [v.timestamp_s for v in seen.views] == [v.timestamp_s for v in views]
+    for got, wanted in zip([*seen.views, *seen.holdout], [*new[1:5], new[8], new[0]], strict=True):
+        assert (got.world_from_cam == wanted.world_from_cam).all()
 
 
 def test_without_masks_the_matches_keep_their_weight(scene: Any) -> None:

@@ -20,13 +20,13 @@ class LateMasks:
 
     def __init__(self) -> None:
         self._targets: dict[int, Array] = {}  # frame index -> (m,) float32 P(static) where its matches are
-        self._keyframes: dict[int, Array] = {}  # kf id -> (h, w) uint8, 255 x P(moving)
+        self._hosts: dict[int, Array] = {}  # kf id -> (p,) float32 P(static) at its px
 
-    def see(self, record: FrameRecord, moving: Array) -> None:
+    def see(self, graph: KeyframeGraph, record: FrameRecord, moving: Array) -> None:
         """The mask of one frame, (h, w) P(moving) at working size."""
-        self._targets[record.index] = static_at(moving, record.target).astype(np.float32)
+        self._targets[record.index] = _static(moving, record.target)
         if record.is_keyframe:
-            self._keyframes[record.kf_id] = np.rint(255 * moving).astype(np.uint8)
+            self._hosts[record.kf_id] = _static(moving, graph.blocks[record.kf_id].px)
 
     def poses(self, graph: KeyframeGraph) -> list[FinalFrame]:
         """Every frame's pose from the matches that the masks leave.
@@ -38,13 +38,11 @@ class LateMasks:
 
     def weigh(self, graph: KeyframeGraph) -> None:
         """The matches that frames keep of their keyframes count by P(static) at both ends."""
-        static = {k: _static(m, graph.blocks[k].px) for k, m in self._keyframes.items()}
         for r in graph.records:
-            if len(r.points):
-                at_keyframe = static[r.kf_id][r.points] if r.kf_id in static else 1.0
-                at_frame = np.maximum(self._targets.get(r.index, 1.0), LEAST)
-                r.weight = (r.weight * at_frame * at_keyframe).astype(np.float32)
+            host = self._hosts.get(r.kf_id)
+            at_keyframe = np.float32(1) if host is None else host[r.points]
+            r.weight = r.weight * self._targets.get(r.index, np.float32(1)) * at_keyframe
 
 
 def _static(moving: Array, px: Array) -> Array:
-    return np.maximum(static_at(moving / np.float32(255), px), LEAST)
+    return np.maximum(static_at(moving, px), LEAST).astype(np.float32)

@@ -109,7 +109,7 @@ def second_pass(frames: Iterator[Frame], look: Look, on_mask: Callable[[SeenMask
         for mask in belief.masks(inputs):
             one = waiting.popleft()
             place = one.place
-            out.late.see(place.record, mask.probability)
+            out.late.see(graph, place.record, mask.probability)
             moving = _over_photograph(mask.probability, look.rectifier)
             shown = SeenMask(place.record.timestamp_s, one.small, mask, moving)
             written.append(writer.later(partial(on_mask, shown)))
