@@ -87,6 +87,23 @@ def test_where_few_match_features_are_asked_and_the_better_start_is_kept() -> No
     assert parts.features.asked == 1  # type: ignore[attr-defined] # enough matched: nothing else was tried
 
 
+def test_before_a_start_what_passes_in_front_makes_no_keyframe() -> None:
+    """A still camera, and a third of the picture 12 px aside: nobody knows yet that it moves by itself."""
+    ref, shifted, _ = pair_of(np.eye(2), np.array([12.0, 0.0]))
+    new = np.where(np.arange(320) > 215, shifted, ref)
+    parts = Parts(GeometricPointmaps(320, 240, 10), (320, 240))
+    slam = Slam(Config(semantics="none"), parts, (320, 240))
+    slam.step(Frame(0, 0.0, np.dstack([ref] * 3)))
+    keyframe, work = slam.graph.keyframes[0], parts.observe(Frame(1, 0.1, np.dstack([new] * 3)))
+    still, nothing = Later.known(np.zeros((240, 320), np.float32)), np.zeros((240, 320, 2), np.float32)
+    motion = []
+    for started in (set(), {0}):
+        slam.graph.started = started
+        motion.append(slam.comparer.compare(keyframe, work, still, nothing, np.eye(4)).motion_ratio)
+    assert motion[0] < 0.1 * slam.config.tracking.first_motion_ratio
+    assert motion[1] == pytest.approx(12 / np.sqrt(320 * 240), rel=0.05)
+
+
 class Given:
     """Features that say what they are told."""
 
