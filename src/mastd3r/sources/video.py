@@ -323,5 +323,5 @@ def _frames_and_losses(container: Any, stream: Any, doubtful: int | None) -> Ite
 
 def _turn_of_frame(frame: Any) -> Turn:
     """The turn that a frame asks for. Only for the first: a frame whose side data was read is freed late."""
-    matrix = next((d for d in frame.side_data if d.type.name == "DISPLAYMATRIX"), None)
+    matrix = frame.side_data.get("DISPLAYMATRIX")  # by name: what iterating gives is another thing since PyAV 19
     return UPRIGHT if matrix is None else turn_of(bytes(matrix))
