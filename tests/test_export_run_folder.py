@@ -94,7 +94,7 @@ def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path: Path) -> None
 
 def test_other_peoples_folders_are_refused_untouched(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
-    with pytest.raises(OutputError, match=r"no run\.json"):
+    with pytest.raises(OutputError, match=r"no run\.json of a run"):
         RunFolder(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 

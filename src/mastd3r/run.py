@@ -115,7 +115,8 @@ def _job(
     parts = build_parts(config, tracked)  # refuses before anything is written
     device = chosen_map_device(config.mapping, parts.notes)
     slam = Slam(_config_of_slam(config, rectifier), parts, tracked.size)
-    job = _Job(source, rectifier, config, slam, RunFolder(out, command), reporter, device)
+    inputs = [Path(p).expanduser() for p in (source_path, maps) if p is not None]
+    job = _Job(source, rectifier, config, slam, RunFolder(out, command, inputs), reporter, device)
     job.folder.note(*told)
     return job
 

@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 from ..errors import OutputError
 from ..geometry.camera import Camera
 from ..types import StaticCloud, Trajectory
-from .files import write_bytes, write_json, write_text, writing
+from .claim import RESERVE, claim
+from .files import write_bytes, write_json, write_text
 from .machine import machine_info
 from .point_cloud import write_cloud
 from .trajectory_files import write_tum
 
 Array = NDArray[Any]
-FILES = (
-    "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply", "gaussians.spz",
-    "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
-)  # fmt: skip
-FOLDERS = ("masks", "renders", "depth")
 RESERVE_BYTES = 2**20  # given back when the disk is full, so that the end of a run can still be written
 
 
@@ -39,14 +35,14 @@ def stamp(timestamp_s: float) -> str:
 class RunFolder:
     """A folder that holds one run. ``run.json`` says "running" until ``finish``.
 
-    Raises OutputError for a folder that is not empty and holds no run.json, and for whatever the system
-    refuses. Files of an earlier run are removed first; files that no run writes are left alone.
+    Files of an earlier run are removed first; files that no run writes are left alone. Raises OutputError as
+    ``claim`` does; ``inputs`` are the paths that the run reads.
     """
 
-    def __init__(self, path: Path | str, command: Sequence[str] = ()) -> None:
+    def __init__(self, path: Path | str, command: Sequence[str] = (), inputs: Sequence[Path] = ()) -> None:
         self.path = Path(path)
-        self._reserve = self.path / ".reserve"
-        self._prepare()
+        self._reserve = self.path / RESERVE
+        claim(self.path, inputs)
         self.record: dict[str, Any] = {
             "status": "running",
             "reason": None,
@@ -142,21 +138,6 @@ class RunFolder:
     def write_json(self, name: str, data: dict[str, Any]) -> None:
         """Any other small file of the run."""
         write_json(self.path / name, data)
-
-    def _prepare(self) -> None:
-        with writing(self.path):
-            self.path.mkdir(parents=True, exist_ok=True)
-            if any(self.path.iterdir()) and not (self.path / "run.json").is_file():
-                raise OutputError(
-                    f"{self.path}: expected an empty folder or an earlier run, got a folder with other files "
-                    f"and no run.json; choose another with --out"
-                )
-            for name in FILES:
-                (self.path / name).unlink(missing_ok=True)
-            for name in FOLDERS:
-                (self.path / name).mkdir(exist_ok=True)
-                for old in (self.path / name).glob("*.png"):
-                    old.unlink()
 
     def _save(self) -> None:
         write_json(self.path / "run.json", self.record)
