@@ -22,17 +22,17 @@ import numpy as np
 import torch
 
 from bench_rasteriser import CASES, random_case
+from mastd3r.camera.pinhole import Camera
+from mastd3r.concurrency import one_torch_thread
 from mastd3r.config import HOLDOUT_EVERY, MappingConfig
 from mastd3r.errors import InputError, SlamError
 from mastd3r.export.machine import machine_info, peak_rss_mib
 from mastd3r.export.read_run import read_run
-from mastd3r.geometry.camera import Camera
 from mastd3r.mapping.gaussians import GaussianArrays, GaussianMap
 from mastd3r.mapping.mapper import Mapper
 from mastd3r.mapping.ply import read_gaussians_ply
 from mastd3r.mapping.rasterise import rasterization, torch_device
 from mastd3r.mapping.rasterise_reference import rasterise_reference
-from mastd3r.mapping.threads import one_torch_thread
 from mastd3r.types import StaticCloud, View
 
 FAILURES = (SlamError, RuntimeError, OSError, ImportError, AttributeError, ValueError, TypeError, KeyError)

@@ -18,12 +18,12 @@ import torch
 from mastd3r.config import Config
 from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
-from mastd3r.finish import final_frames, trajectory_of
-from mastd3r.graph.places import PlaceIndex
+from mastd3r.graph.place_recognition import PlaceRecognition
 from mastd3r.networks.dinov2 import Dinov2Features
 from mastd3r.networks.foreground import ForegroundPrior
 from mastd3r.networks.matching import RecordedMatching, match_pixels
 from mastd3r.networks.pair import PairNetwork
+from mastd3r.offline.final_solve import final_frames, trajectory_of
 from mastd3r.parts import Parts
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
 from mastd3r.pointmap.matching import FoundPixels, MatchOptions, subsampled
@@ -210,8 +210,10 @@ def _tracked(
     matcher = _matcher_of(truth.network)
     most = 4 if b.device.type == "cpu" else 24
     provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
-    places = PlaceIndex(provider.place_descriptor)
-    parts = Parts(provider, (width, height), places=places, own_scale_known=False, pairs_ahead=b.device.type != "cpu")
+    places = PlaceRecognition(provider.place_descriptor)
+    parts = Parts(
+        provider, (width, height), places=places, own_scale_known=False, prefetches_pairs=b.device.type != "cpu"
+    )
     parts.semantic = semantic
     slam = Slam(config, parts, clip.size)
     truth.encoded = truth.decoded = 0
@@ -219,7 +221,7 @@ def _tracked(
     reports = []
     with _watched(stages, truth, parts, slam):
         start = time.perf_counter()
-        for frame in parts.frames_ahead(islice(clip.photographs(), frames), slam.near):
+        for frame in parts.prefetched(islice(clip.photographs(), frames), slam.near):
             reports.append(slam.step(frame))
         b.wait()
         seconds = time.perf_counter() - start

@@ -24,11 +24,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import numpy as np
 
+from mastd3r.concurrency import one_blas_thread
 from mastd3r.config import Config, CorrectionKind
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.geometry.se3 import inverse
-from mastd3r.lookahead import one_blas_thread
 from mastd3r.parts import Parts
 from mastd3r.pointmap.geometric import working_size
 from mastd3r.slam import Slam
@@ -59,7 +59,7 @@ def tracked(source: Source, config: Config, errors: NetworkErrors, seed: int) ->
     for frame in source.frames():
         states.append(slam.step(frame).state)
         record = slam.graph.records[-1]
-        poses.append(inverse(record.cam_from_kf @ slam.graph.blocks[record.kf_id].cam_from_world))
+        poses.append(inverse(record.cam_from_kf @ slam.graph.variables[record.kf_id].cam_from_world))
         stamps.append(frame.timestamp_s)
     path = Trajectory(np.array(stamps), np.stack(poses), tuple(states), np.zeros(len(poses), bool))
     truth = source.truth()

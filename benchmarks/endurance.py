@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mastd3r.concurrency import one_blas_thread
 from mastd3r.config import Config, SourceConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
-from mastd3r.finish import final_frames, finish_graph, trajectory_of
-from mastd3r.lookahead import one_blas_thread
+from mastd3r.offline.final_solve import final_frames, finish_graph, trajectory_of
 from mastd3r.parts import build_parts
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source

@@ -23,14 +23,14 @@ from typing import Any
 import numpy as np
 
 from map_losses import Pictures, clean_pictures, material
+from mastd3r.concurrency import one_blas_thread
 from mastd3r.config import Config
 from mastd3r.evaluation.image_error import psnr
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.trajectory_files import read_tum
-from mastd3r.lookahead import one_blas_thread
 from mastd3r.mapping.mapper import Mapper
-from mastd3r.run import MapMaterial
+from mastd3r.reconstruct import MapMaterial
 from mastd3r.sources import open_source
 
 SEQUENCE, MOVED_M, BOUND_DB = "kitchen", 0.05, 0.5
@@ -54,7 +54,7 @@ def drift_of(keyframes: list[int], shift: float) -> dict[int, np.ndarray]:
     return out
 
 
-def bent(given: MapMaterial, drift: dict[int, np.ndarray]) -> MapMaterial:
+def distorted(given: MapMaterial, drift: dict[int, np.ndarray]) -> MapMaterial:
     """Cloud and views where their keyframes have drifted to."""
     shift = np.stack([drift[int(k)][:3, 3] for k in given.cloud.kf_id])
     cloud = replace(given.cloud, points_world=(given.cloud.points_world + shift).astype(np.float32))
@@ -71,7 +71,7 @@ def quality(
     for place in given.seen.holdout:
         if np.isfinite(place.world_from_cam).all():
             pose, time_s = drift[place.record.kf_id] @ place.world_from_cam, place.record.timestamp_s
-            drawn = given.lens_view.as_photograph(mapper.render(pose, given.lens_view.pinhole, time_s)[0])
+            drawn = given.map_view.as_photograph(mapper.render(pose, given.map_view.pinhole, time_s)[0])
             figures.append(psnr(drawn.clip(0, 1), pictures[round(time_s, 6)][0]))
     return float(np.mean([f for f in figures if f is not None]))
 
@@ -106,7 +106,7 @@ def main() -> int:
     args = parser.parse_args()
     args.runs.mkdir(parents=True, exist_ok=True)
     given = material(args.data / SEQUENCE, args.runs)
-    size = given.lens_view.camera.width, given.lens_view.camera.height
+    size = given.map_view.camera.width, given.map_view.camera.height
     times_s = [place.record.timestamp_s for place in given.seen.holdout]
     pictures = clean_pictures(args.data / SEQUENCE, args.data / SEQUENCE, times_s, size)
     shift = MOVED_M / metres_per_unit(args.data / SEQUENCE, args.runs / SEQUENCE)
@@ -116,7 +116,7 @@ def main() -> int:
     config = replace(
         Config().mapping, iterations=args.iterations + max(args.after), max_gaussians=args.gaussians, device="cpu"
     )
-    drifted = bent(given, drift)
+    drifted = distorted(given, drift)
     mapper = Mapper(config, drifted.cloud, drifted.seen.views, 0)
     mapper.refine(args.iterations)
     figures = {"before_db": quality(mapper, given, drift, pictures)}

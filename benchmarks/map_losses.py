@@ -26,7 +26,7 @@ from mastd3r.config import Config, MappingConfig, with_override
 from mastd3r.evaluation.image_error import psnr, ssim
 from mastd3r.export.machine import machine_info
 from mastd3r.mapping.mapper import Mapper
-from mastd3r.run import MapMaterial, material_for_map
+from mastd3r.reconstruct import MapMaterial, material_for_map
 from mastd3r.sources import open_source
 
 SEQUENCE, CLEAN = "kitchen_walk", "kitchen"
@@ -83,8 +83,8 @@ def trained(given: MapMaterial, config: MappingConfig, seed: int, pictures: Pict
         if not np.isfinite(place.world_from_cam).all():
             continue
         time_s = place.record.timestamp_s
-        color, _, _ = mapper.render(place.world_from_cam, given.lens_view.pinhole, time_s)
-        drawn = given.lens_view.as_photograph(color).clip(0, 1)
+        color, _, _ = mapper.render(place.world_from_cam, given.map_view.pinhole, time_s)
+        drawn = given.map_view.as_photograph(color).clip(0, 1)
         truth, moved = pictures[round(time_s, 6)]
         whole.append(psnr(drawn, truth))
         similar.append(ssim(drawn, truth))
@@ -139,7 +139,7 @@ def main() -> int:
         parser.error(f"{args.out}: expected the schedule {schedule}, got {done['schedule']}; delete it to start again")
     base = replace(MappingConfig(), iterations=args.iterations, max_gaussians=args.gaussians, device="cpu")
     given, info = material(args.data / SEQUENCE, args.runs), machine_info()
-    camera = given.lens_view.camera
+    camera = given.map_view.camera
     times_s = [place.record.timestamp_s for place in given.seen.holdout]
     pictures = clean_pictures(args.data / SEQUENCE, args.data / CLEAN, times_s, (camera.width, camera.height))
     for name, (config, seed) in wanted(base, args.seeds, not args.no_ablation).items():

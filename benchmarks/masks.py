@@ -23,17 +23,17 @@ from typing import Any
 import cv2
 import numpy as np
 
+from mastd3r.camera.map_view import MapView
+from mastd3r.concurrency import one_blas_thread
 from mastd3r.config import Config, with_override
 from mastd3r.evaluation.evaluate import evaluate_trajectory
 from mastd3r.evaluation.mask_error import mask_error, read_mask
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.pictures import mask_overlay
-from mastd3r.finish import FinalFrame, final_frames, finish_graph, trajectory_of
-from mastd3r.lens_view import LensView
-from mastd3r.lookahead import one_blas_thread
+from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
+from mastd3r.offline.smoothing import FrameMask, Look, smooth_masks
 from mastd3r.parts import build_parts
-from mastd3r.second_pass import Look, SeenMask, second_pass
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.types import Source
@@ -151,7 +151,7 @@ class Tracked:
         parts = build_parts(config, self.source)
         self.slam = Slam(config, parts, self.source.size)
         frames, clock, cpu = 0, time.perf_counter(), time.process_time()
-        for frame in parts.frames_ahead(self.source.frames(), self.slam.near):
+        for frame in parts.prefetched(self.source.frames(), self.slam.near):
             self.slam.step(frame)
             frames += 1
         self.slam.close()
@@ -175,7 +175,7 @@ class Tracked:
     def masks(
         self,
         overrides: tuple[str, ...],
-        each: Callable[[SeenMask], None] | None = None,
+        each: Callable[[FrameMask], None] | None = None,
         frames: tuple[int, int] | None = None,
     ) -> dict[str, Any]:
         """Figures of the second pass under other options of the mask; ``frames``: from, and one past the last."""
@@ -185,16 +185,16 @@ class Tracked:
         files = {} if truth is None else truth.moving_files
         pairs: list[tuple[Any, Any]] = []
 
-        def on_mask(seen: SeenMask) -> None:
+        def on_mask(seen: FrameMask) -> None:
             levels = np.ceil(np.clip(seen.over_photograph, 0, 1) * 255 - 0.5).astype(np.uint8)
             file = files.get(seen.timestamp_s)
             pairs.append((levels, None if file is None else read_mask(file)))
             if each is not None:
                 each(seen)
 
-        lens_view = LensView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
-        look = Look(self.final, self.slam.graph, self.slam.parts, config, lens_view, head=self.slam.belief.head.copy())
-        second_pass(islice(self.source.frames(), *(frames or (None,))), look, on_mask)
+        map_view = MapView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
+        look = Look(self.final, self.slam.graph, self.slam.parts, config, map_view, head=self.slam.belief.head.copy())
+        smooth_masks(islice(self.source.frames(), *(frames or (None,))), look, on_mask)
         found = mask_error(pairs)
         return {"iou": found.iou, "false_positives": found.false_positive_ratio, "moving": found.called_moving_ratio}
 
@@ -244,7 +244,7 @@ def _looked_at(args: argparse.Namespace, results: Results, name: str) -> dict[st
     return figures
 
 
-def _small_overlay(seen: SeenMask) -> Any:
+def _small_overlay(seen: FrameMask) -> Any:
     picture = mask_overlay(seen.image, np.rint(255 * seen.mask.probability).astype(np.uint8))
     return cv2.resize(picture, None, fx=360 / picture.shape[1], fy=360 / picture.shape[1], interpolation=cv2.INTER_AREA)
 

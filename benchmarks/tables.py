@@ -2,7 +2,7 @@
 
 usage: python benchmarks/tables.py results.json docs/results.md
 
-Beside results.json: endurance.json, corrections.json, networks.json, reference.json, and in bench/ the results.json
+Worker results.json: endurance.json, corrections.json, networks.json, reference.json, and in bench/ the results.json
 of each bench under its suite's name. Plots go into a folder plots beside the page.
 """
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mastd3r.geometry.camera import Camera
+from mastd3r.camera.pinhole import Camera
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.sources.room import RayGrid, Room, camera_pose
 from mastd3r.sources.synthetic import room_camera

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from mastd3r import __version__
-from mastd3r.cli_commands import _parser
+from mastd3r.cli.commands import _parser
 from mastd3r.config import Config, with_override
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -42,7 +42,7 @@ LAYERS: dict[str, set[str]] = {
     "progress": set(),
     "lookahead": set(),
     "rectify": {"geometry", "types", "errors"},
-    "lens_view": {"geometry", "rectify"},
+    "map_view": {"geometry", "rectify"},
     "view_depth": {"geometry", "types", *STAGES},
     "parts": {*CONTRACTS, *STAGES, "networks", "lookahead"},
     "compare": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lookahead"},
@@ -51,14 +51,14 @@ LAYERS: dict[str, set[str]] = {
     "links": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth"},
     "slam": {"geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "compare", "links", "lookahead", "loops"},
     "late_masks": {"geometry", *CONTRACTS, *STAGES, "view_depth", "finish"},
-    "second_pass": {
-        "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "lens_view", "finish", "late_masks", "rectify",
+    "smooth_masks": {
+        "geometry", *CONTRACTS, *STAGES, "parts", "view_depth", "map_view", "finish", "late_masks", "rectify",
         "lookahead",
     },
-    "showcase": {"geometry", *CONTRACTS, *STAGES, "lens_view", "rectify"},
-    "live_map": {"geometry", *CONTRACTS, *STAGES, "lens_view", "finish", "rectify", "second_pass"},
+    "showcase": {"geometry", *CONTRACTS, *STAGES, "map_view", "rectify"},
+    "live_map": {"geometry", *CONTRACTS, *STAGES, "map_view", "finish", "rectify", "smooth_masks"},
     "run": {
-        "geometry", *CONTRACTS, *STAGES, "parts", "lens_view", "finish", "slam", "second_pass", "progress", "rectify",
+        "geometry", *CONTRACTS, *STAGES, "parts", "map_view", "finish", "slam", "smooth_masks", "progress", "rectify",
         "view_depth", "showcase", "live_map", "lookahead",
     },
     "experiments": {"config", "errors", "evaluation", "export"},

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mastd3r import archives
-from mastd3r.archives import Damaged, check_archive, unpack
+from mastd3r.download import archives
+from mastd3r.download.archives import Damaged, check_archive, unpack
 from mastd3r.errors import InputError, OutputError
 
 FILES = {"a/one.txt": b"one" * 1000, "a/b/two.bin": np.random.default_rng(0).bytes(50_000), "c/three.txt": b""}

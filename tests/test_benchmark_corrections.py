@@ -39,13 +39,13 @@ def test_each_error_is_what_it_says() -> None:
     factors = np.array([np.median(s[known] / plane()[known]) for s in scaled])
     assert all(np.ptp(s[known] / plane()[known]) < 1e-5 for s in scaled)
     assert 0.07 < np.log(factors).std() < 0.13
-    bent = disturbed(plane(), NetworkErrors(0.0, 0.05, 0.0), 3, 0)
-    ratio = np.log(bent[5:] / plane()[5:])
+    distorted = disturbed(plane(), NetworkErrors(0.0, 0.05, 0.0), 3, 0)
+    ratio = np.log(distorted[5:] / plane()[5:])
     assert ratio.std() > 0.005 and np.abs(np.diff(ratio, axis=1)).max() < 0.02
     bled = disturbed(plane(), NetworkErrors(0.0, 0.0, 2.0), 3, 0)
     off = np.abs(bled / np.maximum(plane(), 1e-6) - 1)
     assert off[20:, 38:42].min() > 0.05 and off[20:, :25].max() < 1e-3
-    assert all((d[:5] == 0).all() for d in (scaled[0], bent, bled))
+    assert all((d[:5] == 0).all() for d in (scaled[0], distorted, bled))
 
 
 def test_seed_and_frame_decide() -> None:

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from helpers import write_video
-from mastd3r import run as run_module
-from mastd3r.cli import main
+from mastd3r import reconstruct as run_module
+from mastd3r.cli.main import main
 from mastd3r.export import files
 from mastd3r.types import Frame
 

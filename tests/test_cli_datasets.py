@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import miniatures
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.config import CameraConfig, Config
 from mastd3r.parts import with_dataset_lens
 from mastd3r.sources import open_source

@@ -9,14 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
-from mastd3r.config import (
-    Config,
-    SourceConfig,
-    config_from_dict,
-    config_from_yaml,
-    config_to_yaml,
-    with_override,
-)
+from mastd3r.config import Config, SourceConfig, config_from_dict, config_from_yaml, config_to_yaml, with_override
 from mastd3r.errors import ConfigError
 
 

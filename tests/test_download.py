@@ -18,13 +18,13 @@ import pytest
 
 import miniatures
 from local_server import FileServer, file_server
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.config import SourceConfig
-from mastd3r.datasets import download as module
-from mastd3r.datasets.known import KNOWN
-from mastd3r.datasets.types import Dataset
+from mastd3r.download import datasets as module
+from mastd3r.download.dataset_types import Dataset
+from mastd3r.download.datasets_known import KNOWN
+from mastd3r.download.fetch import Interrupted, fetch
 from mastd3r.errors import ConfigError, InputError, OutputError
-from mastd3r.fetch import Interrupted, fetch
 from mastd3r.sources import open_source
 
 Files = dict[str, bytes]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mastd3r.dynamics import DynamicBelief, DynamicsConfig, DynamicsInput
-from mastd3r.geometry.camera import Camera
+from mastd3r.camera.pinhole import Camera
+from mastd3r.dynamics import DynamicsConfig, DynamicsInput, LogOddsFilter
 
 DATA = Path(os.environ.get("MASTD3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 W, H, SCALE = 512, 384, 0.37  # the map's unit is arbitrary
@@ -41,7 +41,7 @@ def play(config: DynamicsConfig, walk: bool, maps: bool, start: int, count: int)
     seq = DATA / ("kitchen_walk" if walk else "kitchen")
     truth = np.array([[float(v) for v in r] for r in rows(DATA / "kitchen/groundtruth.txt")])
     depth = dict(rows(DATA / "kitchen/depth.txt"))  # type: ignore[arg-type]
-    belief, ious, alone, false = DynamicBelief(config, W, H), [], [], []
+    belief, ious, alone, false = LogOddsFilter(config, W, H), [], [], []
     for i, (stamp, name) in enumerate(rows(seq / "rgb.txt")[start : start + count]):
         pose = np.eye(4)
         row = truth[np.abs(truth[:, 0] - float(stamp)).argmin()]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from test_dynamics_belief import H, W, frame, given
 
 from mastd3r.dynamics import DynamicsConfig
-from mastd3r.dynamics.outline import Outline
-from mastd3r.dynamics.support import CELL_PX, SURE_LEAP, floating_log_ratio, leap_to_border
-from test_dynamics_belief import H, W, frame, given
+from mastd3r.dynamics.depth_support import CELL_PX, SURE_LEAP, floating_log_ratio, leap_to_border
+from mastd3r.dynamics.refinement import EdgeRefinement
 
 ROWS, COLS = 30, 40
 
@@ -56,12 +56,12 @@ def test_the_log_ratio_is_bounded_and_of_the_image() -> None:
 
 
 def test_a_map_that_shows_nothing_near_is_doubted_and_its_outlines_are_not() -> None:
-    outline = Outline(DynamicsConfig(), W, H)
+    outline = EdgeRefinement(DynamicsConfig(), W, H)
     semantic = np.zeros((H, W), np.float32)
     semantic[:, : W // 4] = 1
     told = outline.semantic_log_odds(semantic)
     assert (told[:, : W // 5] > 2.5).all()
     assert (told[:, W // 4 + 1] < -2.5).all()
     assert (told[:, -W // 4 :] > -1.5).all() and (told[:, -W // 4 :] < 0).all()
-    old = Outline(replace(DynamicsConfig(), semantic_missed=0.02), W, H).semantic_log_odds(semantic)
+    old = EdgeRefinement(replace(DynamicsConfig(), semantic_missed=0.02), W, H).semantic_log_odds(semantic)
     assert (old[:, -W // 4 :] < -2.5).all()

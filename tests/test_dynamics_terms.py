@@ -6,22 +6,22 @@ import cv2
 import numpy as np
 import pytest
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.dynamics.data import DynamicsInput
 from mastd3r.dynamics.depth import depth_log_ratio
 from mastd3r.dynamics.motion import (
     along_epipolar,
-    doubt_of_fit,
     flow_covariance,
     motion_log_ratio,
+    noise_inflation,
     pose_jacobian,
     residual_twist,
     rigid_flow,
     texture_information,
 )
-from mastd3r.dynamics.photo import mismatch, photo_variance
+from mastd3r.dynamics.photometric import mismatch, photo_variance
 from mastd3r.dynamics.regions import guided_coefficients, region_mean
-from mastd3r.geometry.camera import Camera
 from mastd3r.geometry.se3 import se3_exp, transform
 
 CONFIG = DynamicsConfig()
@@ -166,12 +166,12 @@ def test_doubt_is_one_where_the_noise_is_as_claimed_and_grows_with_its_square() 
     root = np.linalg.cholesky(np.array([[0.3, 0.1], [0.1, 0.2]]))
     residual = rng.normal(size=(96, 128, 2)) @ root.T
     everywhere = np.ones((96, 128), np.float32)
-    assert doubt_of_fit(residual, cov, everywhere) < 1.2
-    assert doubt_of_fit(3 * residual, cov, everywhere) == pytest.approx(9, rel=0.2)
+    assert noise_inflation(residual, cov, everywhere) < 1.2
+    assert noise_inflation(3 * residual, cov, everywhere) == pytest.approx(9, rel=0.2)
     few = residual.copy()
     few[:20] += 30  # a fifth of the image moves: no reason to doubt the rest
-    assert doubt_of_fit(few, cov, everywhere) < 2.0
-    assert doubt_of_fit(3 * residual, cov, 0 * everywhere) == 1.0
+    assert noise_inflation(few, cov, everywhere) < 2.0
+    assert noise_inflation(3 * residual, cov, 0 * everywhere) == 1.0
 
 
 def test_evidence_of_a_wrong_pose_is_weak() -> None:
@@ -180,6 +180,6 @@ def test_evidence_of_a_wrong_pose_is_weak() -> None:
     cov = np.full((96, 128, 3), 0.0, np.float32) + np.array([0.1, 0.0, 0.1], np.float32)
     residual = (rng.normal(size=(96, 128, 2)) * 3).astype(np.float32)
     plain = motion_log_ratio(residual, cov, CONFIG)
-    factor = doubt_of_fit(residual, cov, np.ones((96, 128), np.float32))
+    factor = noise_inflation(residual, cov, np.ones((96, 128), np.float32))
     doubted = motion_log_ratio(residual, cov * np.float32(factor), CONFIG)
     assert (plain > 1).mean() > 0.8 and (doubted > 1).mean() < 0.2

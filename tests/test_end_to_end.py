@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from helpers import data_path, write_video
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.config import HOLDOUT_EVERY
 from mastd3r.sources.synthetic import make_room_clip
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from known_pair import RoomView, decoded, room, view_of
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.networks import load
 from mastd3r.networks.mast3r import Mast3rConfig, random_mast3r
 from mastd3r.networks.preprocess import PixelMapping, prepare_image

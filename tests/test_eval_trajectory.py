@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.formats import kitti_text
 from mastd3r.export.trajectory_files import quaternion_from_rotation, read_trajectory, read_tum, write_tum

@@ -12,13 +12,7 @@ import yaml
 from mastd3r.config import Config, with_override
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.experiments.published import FILE, published_table, sources
-from mastd3r.experiments.suite import (
-    entries_of,
-    load_suite,
-    sequences_of,
-    shipped_suites,
-    suite_from_dict,
-)
+from mastd3r.experiments.suite import entries_of, load_suite, sequences_of, shipped_suites, suite_from_dict
 from mastd3r.export.metric_names import NAMES
 
 TINY: dict[str, Any] = {

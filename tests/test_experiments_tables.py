@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from mastd3r.cli import main
+from mastd3r.cli.main import main
 from mastd3r.config import Config, config_to_yaml
 from mastd3r.errors import InputError
 from mastd3r.experiments.plots import plots_of

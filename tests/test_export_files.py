@@ -12,12 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
 from mastd3r.export.point_cloud import read_cloud, read_vertices, write_cloud
-from mastd3r.export.trajectory_files import (
-    quaternion_from_rotation,
-    read_tum,
-    rotation_from_quaternion,
-    write_tum,
-)
+from mastd3r.export.trajectory_files import quaternion_from_rotation, read_tum, rotation_from_quaternion, write_tum
 from mastd3r.types import StaticCloud, Trajectory
 
 

@@ -11,12 +11,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.errors import ConfigError, InputError, OutputError
 from mastd3r.export import formats
 from mastd3r.export.formats import cameras_text, evenly, export_run
 from mastd3r.export.point_cloud import write_cloud
 from mastd3r.export.trajectory_files import write_tum
-from mastd3r.geometry.camera import Camera
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.types import StaticCloud, Trajectory
 

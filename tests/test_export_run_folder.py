@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.errors import InputError, OutputError
 from mastd3r.export import files, machine
 from mastd3r.export.read_run import read_run
 from mastd3r.export.run_folder import RunFolder
-from mastd3r.geometry.camera import Camera
 from mastd3r.types import StaticCloud, Trajectory
 
 

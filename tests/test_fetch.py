@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from local_server import FileServer, file_server
-from mastd3r.archives import check_archive
-from mastd3r.errors import InputError, OutputError
-from mastd3r.fetch import (
+from mastd3r.download.archives import check_archive
+from mastd3r.download.fetch import (
     ANYTHING,
     Interrupted,
     Unreachable,
@@ -31,6 +30,7 @@ from mastd3r.fetch import (
     md5_of,
     sha256_of,
 )
+from mastd3r.errors import InputError, OutputError
 
 SIZE = 3_000_000
 DATA = np.random.default_rng(0).bytes(SIZE)

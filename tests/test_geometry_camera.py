@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import CameraConfig
-from mastd3r.geometry.camera import Camera
-from mastd3r.graph.bundle import Lens
-from mastd3r.graph.keyframe_graph import camera_of, inverse_radial, lens_for
+from mastd3r.graph.intrinsics import Intrinsics, camera_of, intrinsics_for, inverse_radial
 
 Array = NDArray[Any]
 
@@ -93,7 +92,7 @@ def test_the_radial_terms_are_those_of_the_definition() -> None:
 @pytest.mark.parametrize("terms", [(0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)])
 def test_any_radial_term_bends_and_pinhole_has_none(terms: tuple[float, float, float]) -> None:
     camera = Camera(300, 300, 150, 120, 320, 240, *terms)
-    assert camera.bent and not camera.pinhole.bent
+    assert camera.distorted and not camera.pinhole.distorted
     corner = np.array([0.5, 0.4, 1.0])
     assert np.abs(camera.project(corner) - camera.pinhole.project(corner)).max() > 0.5
     assert camera.resized(160, 120).pinhole == camera.pinhole.resized(160, 120)
@@ -124,17 +123,17 @@ def test_k1_zero_is_exact() -> None:
 # -- the solver's lens ---------------------------------------------------------------------------------------------
 
 
-def bent_lens(terms: tuple[float, ...], focal_px: float, size: tuple[int, int]) -> Lens:
-    lens = lens_for(CameraConfig(), *size, size)
-    lens.g[[0, 1, 4, 5]] = np.log(focal_px), *terms
+def bent_lens(terms: tuple[float, ...], focal_px: float, size: tuple[int, int]) -> Intrinsics:
+    lens = intrinsics_for(CameraConfig(), *size, size)
+    lens.values[[0, 1, 4, 5]] = np.log(focal_px), *terms
     return lens
 
 
-def undistorted(lens: Lens, px: Array) -> Array:
+def undistorted(lens: Intrinsics, px: Array) -> Array:
     """(p, 3) rays by the solver's own formula."""
-    x = (px - lens.g[2:4]) / np.exp(lens.g[0])
+    x = (px - lens.values[2:4]) / np.exp(lens.values[0])
     r2 = (x**2).sum(1, keepdims=True)
-    u = x * (1 + lens.g[1] * r2 + lens.g[4] * r2**2 + lens.g[5] * r2**3)
+    u = x * (1 + lens.values[1] * r2 + lens.values[4] * r2**2 + lens.values[5] * r2**3)
     return np.concatenate([u, np.ones((len(u), 1))], 1)
 
 
@@ -161,34 +160,36 @@ def test_three_terms_go_from_solver_to_camera_and_back(terms: tuple[float, float
     """With three terms on both sides the picture agrees to 0.05 px, and so do the rays both ways."""
     size, focal_px = (320, 240), 260.0
     lens = bent_lens(terms, focal_px, size)
-    lens.g[2:4] += 4.0, -3.0
+    lens.values[2:4] += 4.0, -3.0
     camera = camera_of(lens, size)
-    assert (camera.cx_px, camera.cy_px) == (163.5, 116.5) and camera.bent
+    assert (camera.cx_px, camera.cy_px) == (163.5, 116.5) and camera.distorted
     np.testing.assert_allclose((camera.k1, camera.k2, camera.k3), inverse_radial(focal_px, terms, size), rtol=1e-9)
     px = camera.pixel_grid()[::8, ::8].reshape(-1, 2)
     rays = undistorted(lens, px)
     assert np.abs(camera.project(rays) - px).max() < 0.05
     assert np.abs(camera.rays(px) - rays).max() * focal_px < 0.1
     again = bent_lens(inverse_radial(focal_px, (camera.k1, camera.k2, camera.k3), size), focal_px, size)
-    again.g[2:4] = lens.g[2:4]
+    again.g[2:4] = lens.values[2:4]
     assert np.abs(undistorted(again, px) - rays).max() * focal_px < 0.1
 
 
 def test_given_intrinsics_are_scaled_and_fixed() -> None:
-    lens = lens_for(CameraConfig(intrinsics=(600.0, 610.0, 320.0, 239.0)), 320, 240, (640, 480))
-    assert np.exp(lens.g[0]) == pytest.approx(np.sqrt(300 * 305))
-    np.testing.assert_allclose(lens.g[2:4], [(320.5) / 2 - 0.5, (239.5) / 2 - 0.5])
-    assert lens.g.shape == (6,) and (lens.g[[1, 4, 5]] == 0).all()
+    lens = intrinsics_for(CameraConfig(intrinsics=(600.0, 610.0, 320.0, 239.0)), 320, 240, (640, 480))
+    assert np.exp(lens.values[0]) == pytest.approx(np.sqrt(300 * 305))
+    np.testing.assert_allclose(lens.values[2:4], [(320.5) / 2 - 0.5, (239.5) / 2 - 0.5])
+    assert lens.values.shape == (6,) and (lens.values[[1, 4, 5]] == 0).all()
     assert not lens.free.any()
-    unknown = lens_for(CameraConfig(estimate_radial=False), 320, 240, (640, 480))
+    unknown = intrinsics_for(CameraConfig(estimate_radial=False), 320, 240, (640, 480))
     np.testing.assert_array_equal(unknown.free, [True] + [False] * 5)
-    assert lens_for(CameraConfig(), 320, 240, (640, 480)).free.all()
+    assert intrinsics_for(CameraConfig(), 320, 240, (640, 480)).free.all()
 
 
 def test_a_given_radial_term_reaches_the_solver_and_comes_back() -> None:
     size = (320, 240)
     for k1 in (-0.1, 0.04):
-        lens = lens_for(CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5, k1)), *size, size)
-        assert lens.g[1] == inverse_radial(260.0, (k1, 0.0, 0.0), size)[0] and np.sign(lens.g[1]) == -np.sign(k1)
-        assert (lens.g[4:] == 0).all()
+        lens = intrinsics_for(CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5, k1)), *size, size)
+        assert lens.values[1] == inverse_radial(260.0, (k1, 0.0, 0.0), size)[0] and np.sign(lens.values[1]) == -np.sign(
+            k1
+        )
+        assert (lens.values[4:] == 0).all()
         assert camera_of(lens, size).k1 == pytest.approx(k1, abs=0.15 * abs(k1))

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mastd3r.geometry.gauss_newton import damped_solve
-from mastd3r.geometry.reprojection import (
+from mastd3r.geometry.least_squares import damped_solve
+from mastd3r.geometry.reprojection_kernels import (
     MIN_DEPTH,
     N_COLS,
+    anchor_cost,
+    anchor_system,
     edge_residuals,
     fold_radius,
-    host_cost,
-    host_system,
     pose_system,
 )
 from mastd3r.geometry.se3 import se3_exp
@@ -100,7 +100,7 @@ def close(found: Array, wanted: Array, tolerance: float = 2e-5) -> None:
 @given(seeds)
 def test_all_columns_and_the_depth_agree_with_finite_differences(seed: int) -> None:
     s = Edges(seed)
-    hess, rhs, cross, hdd, bd, cost = host_system(*s.args(), WIDE_PX)
+    hess, rhs, cross, hdd, bd, cost = anchor_system(*s.args(), WIDE_PX)
     for e in range(len(s.pose)):
         r = s.residual(np.zeros(DEPTH + 1), s.pose[e], s.target[e])
         jac, w = s.jacobian(e), s.weight[e]
@@ -119,7 +119,7 @@ def test_each_column_by_itself(seed: int) -> None:
     """One match at a time: H determines its two-row Jacobian up to a rotation, and b and E fix that."""
     s = Edges(seed, edges=1, points=1)
     jac = s.jacobian(0)[0]
-    hess, rhs, cross, hdd, _, _ = host_system(*s.args(), WIDE_PX)
+    hess, rhs, cross, hdd, _, _ = anchor_system(*s.args(), WIDE_PX)
     w = s.weight[0, 0]
     close(np.sqrt(np.diag(hess[0]))[None], np.sqrt(w) * np.linalg.norm(jac[:, :DEPTH], axis=0)[None], 1e-4)
     close(cross[0], w * (jac[:, :DEPTH].T @ jac[:, DEPTH])[None], 1e-4)
@@ -134,8 +134,8 @@ def test_host_cost_is_the_cost_of_host_system(seed: int, kernel_px: float) -> No
     s = Edges(seed)
     s.weight[0, :3] = 0
     s.pose[1, 2, 3] -= 1.5  # some points of the second edge come behind the camera
-    cost = host_cost(*s.args(), kernel_px)
-    np.testing.assert_allclose(cost, host_system(*s.args(), kernel_px)[5], rtol=1e-12)
+    cost = anchor_cost(*s.args(), kernel_px)
+    np.testing.assert_allclose(cost, anchor_system(*s.args(), kernel_px)[5], rtol=1e-12)
     r, z = edge_residuals(s.px, s.depth, s.target[1], s.pose[1], s.g)
     behind, c2 = z < MIN_DEPTH, kernel_px**2
     each = np.where(behind, 4 * c2, c2 * np.log1p((r**2).sum(1) / c2))
@@ -148,7 +148,7 @@ def test_host_cost_is_the_cost_of_host_system(seed: int, kernel_px: float) -> No
 def test_the_step_descends(seed: int, kernel_px: float) -> None:
     """b is minus half the gradient of the robust cost, so a short step along it lowers the cost."""
     s = Edges(seed, edges=1)
-    rhs = host_system(*s.args(), kernel_px)[1][0]
+    rhs = anchor_system(*s.args(), kernel_px)[1][0]
     step = np.zeros(6)
     for i in range(6):
         step[:] = 0
@@ -156,7 +156,7 @@ def test_the_step_descends(seed: int, kernel_px: float) -> None:
         ends = []
         for sign in (1, -1):
             pose = (se3_exp(sign * step) @ s.pose[0])[None]
-            ends.append(host_cost(s.px, s.depth, s.target, s.weight, pose, s.g, kernel_px)[0])
+            ends.append(anchor_cost(s.px, s.depth, s.target, s.weight, pose, s.g, kernel_px)[0])
         gradient = (ends[0] - ends[1]) / 2e-6
         assert gradient == pytest.approx(-2 * rhs[i], rel=1e-4, abs=1e-3 * np.abs(rhs).max())
 
@@ -186,17 +186,17 @@ def plain_residual(s: Edges, e: int, n: int) -> Array:
     """One residual written out from the definition, the lens inverted by bisection."""
     f, k, centre, m, n3 = np.exp(s.g[0]), s.g[1], s.g[2:4], s.g[4], s.g[5]
 
-    def bent(r: float) -> float:
+    def distorted(r: float) -> float:
         return float(r * (1 + k * r**2 + m * r**4 + n3 * r**6))
 
     at = (s.px[n] - centre) / f
     radius = float(np.linalg.norm(at))
-    point = s.pose[e][:3, :3] @ [*(at * bent(radius) / radius), 1.0] + s.pose[e][:3, 3] * s.depth[n]
+    point = s.pose[e][:3, :3] @ [*(at * distorted(radius) / radius), 1.0] + s.pose[e][:3, 3] * s.depth[n]
     q = point[:2] / point[2]
     low, high = 0.0, fold_radius(k, m, n3)[0]  # one root in there, as the slope is positive
     for _ in range(80):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if bent(middle) < np.linalg.norm(q) else (low, middle)
+        low, high = (middle, high) if distorted(middle) < np.linalg.norm(q) else (low, middle)
     return np.asarray(s.target[e, n] - centre - f * low * q / np.linalg.norm(q))
 
 
@@ -240,13 +240,13 @@ def test_beyond_the_fold_a_point_costs_what_one_behind_the_camera_does() -> None
     target, weight = px[None].copy(), np.array([[0.5, 0.8]])
     r, z = edge_residuals(px, depth, target[0], pose, g)
     assert (r[0] == 1e3).all() and z[0] < MIN_DEPTH and z[1] == pytest.approx(1.0) and np.abs(r[1]).max() < 400
-    hess, rhs, cross, hdd, bd, cost = host_system(px, depth, target, weight, pose[None], g, 2.0)
-    alone = host_system(px[1:], depth[1:], target[:, 1:], weight[:, 1:], pose[None], g, 2.0)
+    hess, rhs, cross, hdd, bd, cost = anchor_system(px, depth, target, weight, pose[None], g, 2.0)
+    alone = anchor_system(px[1:], depth[1:], target[:, 1:], weight[:, 1:], pose[None], g, 2.0)
     np.testing.assert_allclose(hess, alone[0])
     np.testing.assert_allclose(rhs, alone[1])
     assert (cross[0, 0] == 0).all() and hdd[0, 0] == bd[0, 0] == 0
     assert cost[0] == pytest.approx(alone[5][0] + 0.5 * 4 * 2.0**2)
-    np.testing.assert_allclose(host_cost(px, depth, target, weight, pose[None], g, 2.0), cost)
+    np.testing.assert_allclose(anchor_cost(px, depth, target, weight, pose[None], g, 2.0), cost)
     pose_hess, _, pose_cost = pose_system(px, depth, np.ones(2), target[0], weight[0], pose, g, 2.0)
     one_hess, _, one_cost = pose_system(px[1:], depth[1:], np.ones(1), target[0, 1:], weight[0, 1:], pose, g, 2.0)
     np.testing.assert_allclose(pose_hess, one_hess)
@@ -268,7 +268,7 @@ def test_sure_and_unknown_depths_are_the_limits_of_pose_system() -> None:
     s = Edges(3, edges=1)
     args = (s.target[0], s.weight[0], s.pose[0], s.g, WIDE_PX)
     sure, b, cost = pose_system(s.px, s.depth, np.full(len(s.px), 1e12), *args)
-    hess, rhs, _, _, _, whole = host_system(*s.args(), WIDE_PX)
+    hess, rhs, _, _, _, whole = anchor_system(*s.args(), WIDE_PX)
     np.testing.assert_allclose(sure, hess[0, :6, :6], rtol=1e-5, atol=1e-2)
     np.testing.assert_allclose(b, rhs[0, :6], rtol=1e-5, atol=1e-2)
     assert cost == pytest.approx(whole[0], rel=1e-6)
@@ -280,7 +280,7 @@ def test_weight_zero_has_no_say() -> None:
     s = Edges(5, edges=1)
     s.target[0, 4] = np.nan
     s.weight[0, 4] = 0
-    hess, rhs, *_, cost = host_system(*s.args(), 1.0)
+    hess, rhs, *_, cost = anchor_system(*s.args(), 1.0)
     assert np.isfinite(hess).all() and np.isfinite(rhs).all() and np.isfinite(cost).all()
 
 

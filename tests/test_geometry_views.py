@@ -10,18 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mastd3r.camera.map_view import MapView
+from mastd3r.camera.pinhole import Camera
 from mastd3r.dynamics.flow import HalfFlow
-from mastd3r.geometry.camera import Camera
-from mastd3r.lens_view import LensView
-from mastd3r.second_pass import is_holdout, uncertainty_weight
-from mastd3r.view_depth import (
-    cell_centres,
-    chained_flow,
-    invert_flow,
-    own_depth_spread,
-    reprojection_residual_px,
-    static_at,
-)
+from mastd3r.dynamics.soft_mask import static_at
+from mastd3r.dynamics.uncertainty import SeenFrom, reprojection_residual_px, uncertainty_weight
+from mastd3r.graph.prediction import cell_centres
+from mastd3r.offline.smoothing import is_holdout
+from mastd3r.pointmap.flow_maps import chained_flow, invert_flow
+from mastd3r.tracking.depth_prior import own_depth_spread
 
 Array = NDArray[Any]
 
@@ -35,7 +32,7 @@ def smooth_picture(width: int, height: int) -> Array:
 @pytest.mark.parametrize("k1", [-0.12, -0.03, 0.05])
 def test_a_photograph_survives_the_pinhole_image(k1: float) -> None:
     full = Camera.centred(300, 320, 240, k1)
-    view = LensView(full, 160, 2.0)
+    view = MapView(full, 160, 2.0)
     assert view.pinhole.k1 == 0 and (view.camera.width, view.camera.height) == (160, 120)
     photo = smooth_picture(320, 240)
     pinhole, inside = view.pinhole_image(photo)
@@ -53,7 +50,7 @@ def test_a_photograph_survives_the_pinhole_image(k1: float) -> None:
 def test_the_pinhole_image_is_straight() -> None:
     """A point of the photograph lands where its ray meets the pinhole image."""
     full = Camera.centred(300, 320, 240, -0.1)
-    view = LensView(full, 320, 2.0)
+    view = MapView(full, 320, 2.0)
     photo = np.zeros((240, 320, 3), np.uint8)
     at = np.array([[40.0, 50], [280, 200], [160, 30]])
     for x, y in at.astype(int):
@@ -66,12 +63,12 @@ def test_the_pinhole_image_is_straight() -> None:
 
 
 def test_a_lens_without_distortion_changes_nothing() -> None:
-    view = LensView(Camera.centred(300, 320, 240), 320, 2.0)
+    view = MapView(Camera.centred(300, 320, 240), 320, 2.0)
     photo = smooth_picture(320, 240)
     pinhole, inside = view.pinhole_image(photo)
     np.testing.assert_allclose(pinhole, photo / 255, atol=1e-6)
     assert view.pad_px == 0 and inside.all() and view.as_photograph(pinhole) is pinhole
-    assert LensView(Camera.centred(300, 320, 240), 999, 2.0).camera.width == 320  # never enlarged
+    assert MapView(Camera.centred(300, 320, 240), 999, 2.0).camera.width == 320  # never enlarged
 
 
 def test_flows_are_inverted_and_chained() -> None:
@@ -118,7 +115,7 @@ def test_the_spread_of_own_depths_is_measured(sigma: float) -> None:
     rng = np.random.default_rng(0)
     y, x = np.divmod(np.arange(400), 20)
     px = np.stack([10 * x + 5, 10 * y + 5], 1).astype(float)
-    keyframes, blocks = [], {}
+    keyframes, variables = [], {}
     for n in range(4):
         inv_depth = rng.uniform(0.2, 1.0, 400)
         away = rng.normal(0, sigma, 400)
@@ -127,9 +124,11 @@ def test_the_spread_of_own_depths_is_measured(sigma: float) -> None:
         dense = np.kron(own.reshape(20, 20), np.ones((10, 10))).astype(np.float32)
         info = np.where(rng.random(400) < 0.7, 1e4, 10.0) / inv_depth**2  # a third is not fixed by matches
         solved = np.where(info * inv_depth**2 > 100, inv_depth * np.exp(away / 3), 1.5 * inv_depth)
-        blocks[n] = SimpleNamespace(px=px, inv_depth=solved, depth_info=info, prior_info=info / 2)  # leans by a third
+        variables[n] = SimpleNamespace(
+            px=px, inv_depth=solved, depth_info=info, prior_info=info / 2
+        )  # leans by a third
         keyframes.append(SimpleNamespace(id=n, work=SimpleNamespace(own_inv_depth=dense)))
-    graph: Any = SimpleNamespace(keyframes=keyframes, blocks=blocks)
+    graph: Any = SimpleNamespace(keyframes=keyframes, variables=variables)
     assert own_depth_spread(graph) == pytest.approx(sigma, rel=0.15)
     graph.keyframes = [SimpleNamespace(id=0, work=SimpleNamespace(own_inv_depth=None))]
     assert own_depth_spread(graph) is None
@@ -141,17 +140,22 @@ def wall_seen_from(x: float, picture: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(picture[:192, start : start + 256])
 
 
-def graph_of(grays: dict[float, np.ndarray]) -> Any:
-    """What ``reprojection_residual_px`` asks of a graph: keyframes at x = the keys, one lens."""
-    blocks, keyframes = {}, []
-    for n, (x, gray) in enumerate(grays.items()):
+CAMERA = Camera.centred(200.0, 256, 192)
+
+
+def keyframes_of(grays: dict[float, np.ndarray]) -> list[SeenFrom]:
+    """Keyframes at x = the keys, in which nothing moves."""
+    out = []
+    for x, gray in grays.items():
         cam_from_world = np.eye(4)
         cam_from_world[0, 3] = -x
-        blocks[n] = SimpleNamespace(cam_from_world=cam_from_world)
-        still = np.zeros(gray.shape, np.uint8)
-        keyframes.append(SimpleNamespace(work=SimpleNamespace(gray=gray), moving=still))
-    camera = Camera.centred(200.0, 256, 192)
-    return SimpleNamespace(camera=lambda: camera, size=(256, 192), blocks=blocks, keyframes=keyframes)
+        out.append(SeenFrom(gray, np.zeros(gray.shape, np.uint8), cam_from_world))
+    return out
+
+
+def residual_px(keyframes: list[SeenFrom], view: np.ndarray) -> np.ndarray:
+    inv_depth = np.full((192, 256), 0.5, np.float32)
+    return reprojection_residual_px(keyframes, CAMERA, np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0)
 
 
 def test_reprojection_residual_finds_what_moved_and_nothing_else() -> None:
@@ -168,19 +172,17 @@ def test_reprojection_residual_finds_what_moved_and_nothing_else() -> None:
         return image
 
     view = shown(0.0, 90)
-    graph = graph_of({-0.1: shown(-0.1, 84), 0.1: shown(0.1, 96)})  # on the wall it would be at 100 and 80
-    inv_depth = np.full((192, 256), 0.5, np.float32)
-    residual = reprojection_residual_px(graph, [0, 1], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0)
+    keyframes = keyframes_of({-0.1: shown(-0.1, 84), 0.1: shown(0.1, 96)})  # on the wall it would be at 100 and 80
+    residual = residual_px(keyframes, view)
     moved = np.zeros((96, 128), bool)
     moved[30:66, 45:65] = True
     near = cv2.dilate(moved.astype(np.uint8), np.ones((15, 15))) > 0
     assert (residual[moved] > 2).mean() > 0.4
     assert (residual[~near] > 2).mean() < 0.05
-    graph.keyframes[0].moving[:], graph.keyframes[1].moving[:] = 255, 255
-    assert not reprojection_residual_px(graph, [0, 1], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0).any()
-    still = graph_of({-0.1: wall_seen_from(-0.1, picture), 0.1: wall_seen_from(0.1, picture)})
-    quiet = reprojection_residual_px(
-        still, [0, 1], np.eye(4), wall_seen_from(0.0, picture), inv_depth, HalfFlow(128, 96), 8.0
-    )
+    for kf in keyframes:
+        kf.moving[:] = 255
+    assert not residual_px(keyframes, view).any()
+    still = keyframes_of({-0.1: wall_seen_from(-0.1, picture), 0.1: wall_seen_from(0.1, picture)})
+    quiet = residual_px(still, wall_seen_from(0.0, picture))
     assert (quiet > 2).mean() < 0.03
-    assert not reprojection_residual_px(still, [], np.eye(4), view, inv_depth, HalfFlow(128, 96), 8.0).any()
+    assert not residual_px([], view).any()

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 
 from mastd3r.config import CameraConfig, Config, GraphConfig
 from mastd3r.errors import InputError
-from mastd3r.finish import final_frames, finish_graph, static_cloud, trajectory_of
 from mastd3r.geometry.se3 import interpolate, inverse, se3_exp, se3_log
-from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
-from mastd3r.late_masks import LateMasks
-from mastd3r.second_pass import SecondPass
+from mastd3r.graph.intrinsics import intrinsics_for
+from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.offline.final_solve import final_frames, finish_graph, trajectory_of
+from mastd3r.offline.reweighting import MaskReweighting
+from mastd3r.offline.smoothing import SmoothedMasks
+from mastd3r.offline.static_cloud import static_cloud
 from mastd3r.types import View
 
 Array = NDArray[Any]
@@ -30,8 +32,8 @@ def world_from(scene: Any, k: int) -> Array:
 def tracked_graph(scene: Any, lost: set[int], noise_px: float = 0.2, count: int = 13) -> KeyframeGraph:
     """Frames 0 … count - 1 of the scene; 0, 6, 12 are keyframes with true depths; guesses are a little off."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
-    graph.lens.g = scene.lens.copy()
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values = scene.lens.copy()
     graph.started.add(0)
     p, rng = len(scene.px), np.random.default_rng(0)
     nothing_moves = np.zeros((scene.height, scene.width))
@@ -41,7 +43,7 @@ def tracked_graph(scene: Any, lost: set[int], noise_px: float = 0.2, count: int 
             kf = graph.add_keyframe(
                 work, np.ones(p), nothing_moves, inverse(world_from(scene, k)), 1 / scene.depth(k), np.ones(p)
             )
-            graph.blocks[kf.id].depth_info = np.full(p, 1e6)
+            graph.variables[kf.id].depth_info = np.full(p, 1e6)
             graph.record(work, kf.id, np.eye(4), "tracked", None, np.zeros(0))
             graph.replace_last_by_keyframe(kf)
             continue
@@ -118,13 +120,13 @@ def test_late_masks_take_what_moves_out_of_the_poses(scene: Any) -> None:
         return max(np.linalg.norm(se3_log(inverse(t) @ f.world_from_cam)) for t, f in zip(truth, frames, strict=True))
 
     before = worst(final_frames(graph))
-    keyframes = {k: b.cam_from_world.copy() for k, b in graph.blocks.items()}
-    late = LateMasks()
+    keyframes = {k: b.cam_from_world.copy() for k, b in graph.variables.items()}
+    late = MaskReweighting()
     for r in graph.records:
         late.see(graph, r, moving)
     after = worst(late.poses(graph))
     assert after < 0.5 * before and after < 0.01
-    assert all((graph.blocks[k].cam_from_world == pose).all() for k, pose in keyframes.items())
+    assert all((graph.variables[k].cam_from_world == pose).all() for k, pose in keyframes.items())
     on_it = np.concatenate([r.weight[slides[r.points]] for r in graph.records])
     off_it = np.concatenate([r.weight[scene.px[r.points, 0] > scene.width / 3 + 20] for r in graph.records])
     assert on_it.max() < 0.03 and off_it.min() > 0.9
@@ -138,7 +140,7 @@ def test_views_and_holdout_take_the_new_poses(scene: Any) -> None:
     views = [
         View(f.record.timestamp_s, blank, blank, f.world_from_cam, graph.camera(), f.record.kf_id) for f in old[1:5]
     ]
-    seen = SecondPass(views=views, holdout=[old[8], old[0]]).with_poses(new)
+    seen = SmoothedMasks(views=views, holdout=[old[8], old[0]]).with_poses(new)
     assert [v.timestamp_s for v in seen.views] == [v.timestamp_s for v in views]
     for got, wanted in zip([*seen.views, *seen.holdout], [*new[1:5], new[8], new[0]], strict=True):
         assert (got.world_from_cam == wanted.world_from_cam).all()
@@ -147,13 +149,13 @@ def test_views_and_holdout_take_the_new_poses(scene: Any) -> None:
 def test_without_masks_the_matches_keep_their_weight(scene: Any) -> None:
     graph = tracked_graph(scene, {4})
     before = [r.weight.copy() for r in graph.records]
-    LateMasks().weigh(graph)
+    MaskReweighting().weigh(graph)
     assert all((r.weight == w).all() for r, w in zip(graph.records, before, strict=True))
 
 
 def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
     p = len(scene.px)
     graph.add_keyframe(scene.work_frame(0), np.ones(p), np.zeros((240, 320)), np.eye(4), np.ones(p), np.ones(p))
     with pytest.raises(InputError, match=r"camera never moves enough: expected .* 5% .*, got 1 view"):
@@ -163,8 +165,8 @@ def test_a_camera_that_never_moves_is_refused(scene: Any) -> None:
 def cloud_inputs(graph: KeyframeGraph, scene: Any) -> tuple[dict[int, Array], dict[int, Array]]:
     rng = np.random.default_rng(0)
     p = len(scene.px)
-    colors = {k: rng.integers(0, 255, (p, 3)).astype(np.uint8) for k in graph.blocks}
-    return colors, {k: np.zeros(p) for k in graph.blocks}
+    colors = {k: rng.integers(0, 255, (p, 3)).astype(np.uint8) for k in graph.variables}
+    return colors, {k: np.zeros(p) for k in graph.variables}
 
 
 def test_the_cloud_lies_on_the_surface(scene: Any) -> None:
@@ -199,7 +201,7 @@ def test_moving_points_are_pruned_and_doubtful_ones_count_less(scene: Any) -> No
 
 def test_points_nobody_has_measured_are_pruned(scene: Any) -> None:
     graph = tracked_graph(scene, set())
-    for b in graph.blocks.values():
+    for b in graph.variables.values():
         b.depth_info, b.prior_info = np.zeros(len(b.px)), np.full(len(b.px), 1e-6)
     colors, moving = cloud_inputs(graph, scene)
     assert len(static_cloud(graph, colors, moving).points_world) == 0
@@ -215,8 +217,8 @@ def test_finishing_improves_disturbed_keyframes(scene: Any) -> None:
                 graph.connect(i, j, scene.matches(a, b, 0.2), np.ones(len(scene.px)))
     rng = np.random.default_rng(1)
     for k in (1, 2):
-        graph.blocks[k].cam_from_world = se3_exp(rng.normal(0, 0.02, 6)) @ graph.blocks[k].cam_from_world
-    for b in graph.blocks.values():
+        graph.variables[k].cam_from_world = se3_exp(rng.normal(0, 0.02, 6)) @ graph.variables[k].cam_from_world
+    for b in graph.variables.values():
         b.depth_info = np.zeros(0)
         b.prior_info = np.full(len(b.px), 1e-2)
     config = replace(Config(), graph=replace(GraphConfig(), final_iterations=30))

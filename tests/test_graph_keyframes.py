@@ -10,18 +10,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import CameraConfig, GraphConfig
-from mastd3r.geometry.camera import Camera
-from mastd3r.geometry.reprojection import host_cost
+from mastd3r.geometry.reprojection_kernels import anchor_cost
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import procrustes
-from mastd3r.graph.bootstrap import bootstrap
-from mastd3r.graph.depth import carried, filled, trust, upsampled
-from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
-from mastd3r.graph.places import PlaceIndex, covisible, nearest_keyframe, overlap
+from mastd3r.graph.covisibility import covisible, nearest_keyframe, overlap
+from mastd3r.graph.depth import carried, depth_confidence, inpainted, upsampled
+from mastd3r.graph.initialisation import bootstrap
+from mastd3r.graph.intrinsics import intrinsics_for
+from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.graph.place_recognition import PlaceRecognition
+from mastd3r.graph.prediction import rigid_flow
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.types import Matches
-from mastd3r.view_depth import rigid_flow
 
 Array = NDArray[Any]
 
@@ -32,7 +34,7 @@ def graph_of(
     """A graph with matches between all views; ``solved``: with true poses and depths, otherwise with none."""
     camera = camera or CameraConfig()
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), lens_for(camera, *size, size))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(camera, *size, size))
     p = len(scene.px)
     nothing_moves = np.zeros((scene.height, scene.width))
     for k in range(views):
@@ -44,19 +46,21 @@ def graph_of(
             if i != j:
                 graph.connect(i, j, scene.matches(i, j, noise_px), np.ones(p))
     if solved:
-        graph.lens.g = scene.lens.copy()
+        graph.intrinsics.values = scene.lens.copy()
         graph.started.add(0)
         for k in range(views):
-            graph.blocks[k].depth_info = np.full(p, 1e4)
+            graph.variables[k].depth_info = np.full(p, 1e4)
     return graph
 
 
 def costs(graph: KeyframeGraph) -> Array:
     out = []
     for e in graph.edges:
-        a, b = graph.blocks[e.i], graph.blocks[e.j]
+        a, b = graph.variables[e.i], graph.variables[e.j]
         j_from_i = (b.cam_from_world @ inverse(a.cam_from_world))[None]
-        out.append(host_cost(a.px, a.inv_depth, e.target[None], e.weight[None], j_from_i, graph.lens.g, 1.0)[0])
+        out.append(
+            anchor_cost(a.px, a.inv_depth, e.target[None], e.weight[None], j_from_i, graph.intrinsics.values, 1.0)[0]
+        )
     return np.array(out)
 
 
@@ -67,7 +71,7 @@ def test_bootstrap_from_nothing(exact_scene: Callable[..., Any], focal_px: float
     graph = graph_of(scene, 5, noise_px=0.2)
     assert bootstrap(graph) and graph.initialised
     report = graph.solve_all(40, 0.5)
-    assert np.exp(graph.lens.g[0]) == pytest.approx(focal_px, rel=0.05)
+    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(focal_px, rel=0.05)
     found = np.stack([graph.world_from_cam(i) for i in range(5)])
     truth = np.stack([scene.cam_from_world[0] @ inverse(scene.cam_from_world[i]) for i in range(5)])
     np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)  # the gauge: the world is the first camera
@@ -79,8 +83,8 @@ def test_bootstrap_from_nothing(exact_scene: Callable[..., Any], focal_px: float
     assert max(turns) < 0.03
     assert np.median([graph.median_inv_depth(i) for i in range(3)]) == pytest.approx(1.0)
     for i in range(5):
-        seen = graph.blocks[i].depth_info > 1
-        ratio = fit.scale / graph.blocks[i].inv_depth[seen] / scene.depth(i)[seen]
+        seen = graph.variables[i].depth_info > 1
+        ratio = fit.scale / graph.variables[i].inv_depth[seen] / scene.depth(i)[seen]
         assert np.median(np.abs(ratio - 1)) < 0.06
 
 
@@ -93,7 +97,7 @@ def test_bootstrap_leaves_out_what_moves_by_itself(exact_scene: Callable[..., An
     for e in graph.edges:
         e.target = e.target + moves[:, None] * (e.j - e.i) * np.array([2.0, 8.0])
     assert bootstrap(graph)
-    assert np.exp(graph.lens.g[0]) == pytest.approx(280, rel=0.05)
+    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(280, rel=0.05)
     held = sum(e.weight[moves].sum() for e in graph.edges) / sum(e.weight.sum() for e in graph.edges)
     assert held < 0.02
     for kf in graph.keyframes:
@@ -106,7 +110,7 @@ def test_bootstrap_with_a_given_lens_keeps_it(exact_scene: Callable[..., Any]) -
     given = CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5))
     graph = graph_of(scene, 5, noise_px=0.1, camera=given)
     assert bootstrap(graph)
-    assert np.exp(graph.lens.g[0]) == pytest.approx(260.0) and graph.lens.g[1] == 0.0
+    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(260.0) and graph.intrinsics.values[1] == 0.0
     assert (graph.solve_all(5, 1.0).focal_sigma_ratio) == np.inf
 
 
@@ -123,12 +127,12 @@ def test_a_window_moves_only_what_it_may(exact_scene: Callable[..., Any]) -> Non
     graph.config = replace(graph.config, window=3)
     rng = np.random.default_rng(0)
     for k in (4, 5):
-        graph.blocks[k].cam_from_world = se3_exp(rng.normal(0, 0.01, 6)) @ graph.blocks[k].cam_from_world
-    before = {k: b.cam_from_world.copy() for k, b in graph.blocks.items()}
+        graph.variables[k].cam_from_world = se3_exp(rng.normal(0, 0.01, 6)) @ graph.variables[k].cam_from_world
+    before = {k: b.cam_from_world.copy() for k, b in graph.variables.items()}
     disturbed = costs(graph).sum()
     graph.solve_window()
     for k in range(4):
-        assert (graph.blocks[k].cam_from_world == before[k]).all()
+        assert (graph.variables[k].cam_from_world == before[k]).all()
     assert costs(graph).sum() < 0.5 * disturbed
 
 
@@ -138,29 +142,29 @@ def test_normalise_changes_the_unit_and_nothing_else(exact_scene: Callable[..., 
     frame = scene.work_frame(3)
     motion = se3_exp(np.array([0.1, 0.2, 0.3, 0.1, 0, 0]))
     graph.record(frame, 3, motion, "tracked", scene.matches(2, 3), np.ones(len(scene.px)))
-    before, depth, info = costs(graph), graph.blocks[1].inv_depth, graph.depth_info(1)
+    before, depth, info = costs(graph), graph.variables[1].inv_depth, graph.depth_info(1)
     graph.normalise()
     np.testing.assert_allclose(costs(graph), before, rtol=1e-9)
-    ratio = depth[0] / graph.blocks[1].inv_depth[0]
+    ratio = depth[0] / graph.variables[1].inv_depth[0]
     assert ratio != pytest.approx(1.0, abs=0.01)
-    np.testing.assert_allclose(graph.blocks[1].inv_depth * ratio, depth)
+    np.testing.assert_allclose(graph.variables[1].inv_depth * ratio, depth)
     np.testing.assert_allclose(graph.depth_info(1), info * ratio**2)
     np.testing.assert_allclose(graph.records[0].cam_from_kf[:3, 3], ratio * motion[:3, 3])
     np.testing.assert_allclose(graph.records[0].cam_from_kf[:3, :3], motion[:3, :3])
     np.testing.assert_allclose(np.median([graph.median_inv_depth(k) for k in range(3)]), 1.0)
-    again = graph.blocks[1].inv_depth.copy()
+    again = graph.variables[1].inv_depth.copy()
     graph.normalise()
-    np.testing.assert_allclose(graph.blocks[1].inv_depth, again)
+    np.testing.assert_allclose(graph.variables[1].inv_depth, again)
 
 
 def test_measured_depths_keep_their_unit(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(4, step=0.2)
     graph = graph_of(scene, 4, solved=True)
-    for b in graph.blocks.values():
+    for b in graph.variables.values():
         b.prior_info = 1 / (0.02 * b.inv_depth) ** 2
-    depth = graph.blocks[0].inv_depth.copy()
+    depth = graph.variables[0].inv_depth.copy()
     graph.normalise()
-    np.testing.assert_array_equal(graph.blocks[0].inv_depth, depth)
+    np.testing.assert_array_equal(graph.variables[0].inv_depth, depth)
 
 
 def test_few_matches_make_no_edge(exact_scene: Callable[..., Any]) -> None:
@@ -212,12 +216,12 @@ def test_the_lens_is_freed_as_views_come(
     scene = exact_scene(views, step=0.02, cell_px=60)
     graph = graph_of(scene, views, noise_px=0.3, solved=True)
     graph.config = replace(graph.config, radial_keyframes=8, lens_keyframes=11)
-    before = graph.lens.g.copy()
+    before = graph.intrinsics.values.copy()
     graph.solve_window()
-    np.testing.assert_array_equal(np.flatnonzero(graph.lens.g != before), window)
-    graph.lens.g = before.copy()
+    np.testing.assert_array_equal(np.flatnonzero(graph.intrinsics.values != before), window)
+    graph.intrinsics.values = before.copy()
     graph.solve_all(2, 1.0)
-    np.testing.assert_array_equal(np.flatnonzero(graph.lens.g != before), everything)
+    np.testing.assert_array_equal(np.flatnonzero(graph.intrinsics.values != before), everything)
 
 
 @pytest.mark.parametrize("k", [0.0, -0.05])
@@ -231,9 +235,9 @@ def test_predicted_flow_is_the_projection_of_the_scene(exact_scene: Callable[...
     error = np.linalg.norm(flow[at[:, 1], at[:, 0]] - (matches.new_px - scene.px), axis=1)
     moved = np.linalg.norm(matches.new_px - scene.px, axis=1)
     assert np.median(error) < 0.1 * np.median(moved)
-    away = graph.blocks[1].cam_from_world.copy()
+    away = graph.variables[1].cam_from_world.copy()
     away[2, 3] -= 30  # everything is behind the second camera
-    graph.blocks[1].cam_from_world = away
+    graph.variables[1].cam_from_world = away
     assert np.isfinite(rigid_flow(graph, 0, 1)).all() and np.abs(rigid_flow(graph, 0, 1)).max() <= 640
 
 
@@ -249,8 +253,8 @@ def plane_at(px: Array) -> Array:
 
 def test_trust_is_half_at_a_tenth() -> None:
     depth = np.array([0.5, 2.0])
-    np.testing.assert_allclose(trust(depth, 1 / (0.1 * depth) ** 2), 0.5)
-    assert trust(depth, np.full(2, 1e9)).min() > 0.99 and trust(depth, np.zeros(2)).max() < 1e-9
+    np.testing.assert_allclose(depth_confidence(depth, 1 / (0.1 * depth) ** 2), 0.5)
+    assert depth_confidence(depth, np.full(2, 1e9)).min() > 0.99 and depth_confidence(depth, np.zeros(2)).max() < 1e-9
 
 
 def test_filling_keeps_what_is_known_and_bridges_the_rest(exact_scene: Callable[..., Any]) -> None:
@@ -259,7 +263,7 @@ def test_filling_keeps_what_is_known_and_bridges_the_rest(exact_scene: Callable[
     rng = np.random.default_rng(0)
     known = rng.random(len(truth)) < 0.6
     info = np.where(known, 1e8, 1e-6)
-    found = filled(np.where(known, truth, 7.0), info, scene.grid)
+    found = inpainted(np.where(known, truth, 7.0), info, scene.grid)
     np.testing.assert_allclose(found[known], truth[known], rtol=1e-3)
     assert np.median(np.abs(found[~known] / truth[~known] - 1)) < 0.02
     assert np.abs(found / truth - 1).max() < 0.15
@@ -302,9 +306,9 @@ def test_carrying_a_plane_into_another_view(exact_scene: Callable[..., Any]) -> 
 def test_overlap_falls_with_the_distance(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(6, step=0.3)
     graph = graph_of(scene, 6, solved=True)
-    share, motion = overlap(graph, 2, graph.blocks[2].cam_from_world)
+    share, motion = overlap(graph, 2, graph.variables[2].cam_from_world)
     assert share == 1.0 and motion == pytest.approx(0, abs=1e-9)
-    shares, motions = zip(*(overlap(graph, 0, graph.blocks[k].cam_from_world) for k in range(4)), strict=True)
+    shares, motions = zip(*(overlap(graph, 0, graph.variables[k].cam_from_world) for k in range(4)), strict=True)
     assert list(shares) == sorted(shares, reverse=True) and list(motions) == sorted(motions)
     turned_away = se3_exp(np.array([0, 0, 0, 0, np.pi, 0]))
     assert overlap(graph, 0, turned_away) == (0.0, float("inf"))
@@ -313,11 +317,11 @@ def test_overlap_falls_with_the_distance(exact_scene: Callable[..., Any]) -> Non
 def test_covisible_takes_the_nearest_and_no_neighbours(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(9, step=0.04)
     graph = graph_of(scene, 9, solved=True)
-    graph.blocks[8].cam_from_world = graph.blocks[3].cam_from_world.copy()  # the camera came back
+    graph.variables[8].cam_from_world = graph.variables[3].cam_from_world.copy()  # the camera came back
     assert covisible(graph, 8, 7, 4, 0.5) == [3, 1, 5] or covisible(graph, 8, 7, 4, 0.5) == [3, 5, 1]
     assert covisible(graph, 8, 7, 1, 0.5) == [3]
     assert covisible(graph, 8, 2, 4, 0.5)[0] == 1
-    graph.blocks[8].cam_from_world = se3_exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    graph.variables[8].cam_from_world = se3_exp(np.array([0, 0, 0, 0, np.pi, 0]))
     assert covisible(graph, 8, 7, 4, 0.5) == []
 
 
@@ -336,13 +340,13 @@ def test_nearest_keyframe_is_the_one_with_the_least_motion(exact_scene: Callable
 
 def test_places_know_a_picture_again(exact_scene: Callable[..., Any], room_views: list[SyntheticView]) -> None:
     scene = exact_scene(4)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), 160, 120, (160, 120)))
     grays = [v.frame.image[..., 1] for v in room_views[:2]] + [room_views[0].frame.image[:, ::-1, 1]]
     p = len(scene.px)
     for k, gray in enumerate(grays):
         work = replace(scene.work_frame(k), gray=np.ascontiguousarray(gray))
         graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
-    index = PlaceIndex()
+    index = PlaceRecognition()
     first, third = (graph.keyframes[k].work for k in (0, 2))
     like_first = replace(first, gray=np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8))  # brighter
     assert index.best(graph, like_first, [0, 1, 2])[0].id == 0
@@ -357,10 +361,10 @@ def test_places_are_of_the_keyframes_there_are_now(
 ) -> None:
     """A number that was given to another keyframe after a submap was dropped is looked at anew."""
     scene = exact_scene(2)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), 160, 120, (160, 120)))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), 160, 120, (160, 120)))
     gray = room_views[0].frame.image[..., 1]
     p = len(scene.px)
-    index = PlaceIndex()
+    index = PlaceRecognition()
     for n, images in enumerate(([gray, 255 - gray], [255 - gray, gray])):
         for k, image in enumerate(images):
             work = replace(scene.work_frame(2 * n + k), gray=np.ascontiguousarray(image))
@@ -376,4 +380,4 @@ def test_dropping_the_only_submap_leaves_lost_frames(exact_scene: Callable[..., 
     graph.record(scene.work_frame(0), 0, np.eye(4), "tracked", none, none.weight)
     graph.drop_submap()
     assert [r.state for r in graph.records] == ["lost"] and graph.keyframes == [] and graph.edges == []
-    assert graph.blocks == {} and graph.submap_of == {} and not graph.initialised
+    assert graph.variables == {} and graph.submap_of == {} and not graph.initialised

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from mastd3r.graph.two_threads import on_two_threads
+from mastd3r.concurrency import on_two_threads
 
 
 @pytest.mark.parametrize("slow", [0, 1])

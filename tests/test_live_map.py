@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from mastd3r.cli import main
+from mastd3r.camera.pinhole import Camera
+from mastd3r.cli.main import main
 from mastd3r.config import MappingConfig
-from mastd3r.geometry.camera import Camera
 from mastd3r.mapping.process import KeyframeNews, MapProcess, PoseNews, Trainer
 from mastd3r.types import StaticCloud, View
 

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mastd3r.geometry.se3 import se3_exp
-from mastd3r.mapping.correction import Sight, bend, changes_of, fitted_pose, followed, sight
+from mastd3r.mapping.correction import Visibility, changes_of, deformation, fitted_pose, followed, visibility
 from mastd3r.mapping.gaussians import quaternion_product
 from test_mapping_gaussians import random_map
 
@@ -26,8 +26,8 @@ def camera(kf: int) -> torch.Tensor:
     return torch.from_numpy(np.linalg.inv(motion((0, 0.1 * (1 - kf), 0), CENTRES[kf])))
 
 
-def seen_from(change: np.ndarray, centre: tuple[float, float, float], weight_px: torch.Tensor) -> Sight:
-    return Sight(change, np.linalg.inv(motion((0, 0, 0), centre)), weight_px)
+def seen_from(change: np.ndarray, centre: tuple[float, float, float], weight_px: torch.Tensor) -> Visibility:
+    return Visibility(change, np.linalg.inv(motion((0, 0, 0), centre)), weight_px)
 
 
 def test_weights_of_a_sight_are_shares_of_the_picture() -> None:
@@ -35,11 +35,11 @@ def test_weights_of_a_sight_are_shares_of_the_picture() -> None:
     gaussians = random_map()
     color, _, alpha = gaussians.draw(camera(0), K, 64, 48, 0.1)
     change = motion((0, 0, 0.1), (1, 0, 0))
-    seen = sight(gaussians, change, camera(0), K, torch.ones(48, 64), 0.1)
+    seen = visibility(gaussians, change, camera(0), K, torch.ones(48, 64), 0.1)
     assert torch.allclose(seen.weight_px @ gaussians.colors, color.sum((0, 1)), rtol=1e-4)
     assert float(seen.weight_px.sum()) == pytest.approx(float(alpha.detach().sum()), rel=1e-4)
     assert np.array_equal(seen.change, change) and np.array_equal(seen.cam_from_world, camera(0).numpy())
-    assert torch.all(sight(gaussians, change, camera(0), K, torch.zeros(48, 64), 0.1).weight_px == 0)
+    assert torch.all(visibility(gaussians, change, camera(0), K, torch.zeros(48, 64), 0.1).weight_px == 0)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1.3])
@@ -48,7 +48,7 @@ def test_a_rigid_correction_is_followed_exactly(scale: float) -> None:
     gaussians, change = random_map(), motion((0.2, -0.7, 2.4), (0.3, -2, 1), scale)
     changes = dict.fromkeys(CENTRES, change)
     by_anchor = gaussians.moved(dict.fromkeys(CENTRES, np.eye(4)), changes)
-    seen = [sight(gaussians, change, camera(kf), K, torch.ones(48, 64), 0.1) for kf in CENTRES]
+    seen = [visibility(gaussians, change, camera(kf), K, torch.ones(48, 64), 0.1) for kf in CENTRES]
     by_sight = followed(gaussians, changes, seen)
     assert torch.allclose(by_sight.means, by_anchor.means, atol=1e-5)
     assert torch.allclose(by_sight.log_scales, by_anchor.log_scales, atol=1e-5)
@@ -96,8 +96,8 @@ def test_a_view_along_the_motion_says_little_of_it() -> None:
 
 def test_bend_is_nothing_for_a_rigid_correction_and_the_distance_otherwise() -> None:
     turned = motion((0.2, 0, 1), (1, 2, 3))
-    assert bend([turned] * 4, np.array([1.0, 2, 3])) < 1e-12
-    assert bend([np.eye(4), motion((0, 0, 0), (0.1, 0, 0))], np.ones(3)) == pytest.approx(0.05)
+    assert deformation([turned] * 4, np.array([1.0, 2, 3])) < 1e-12
+    assert deformation([np.eye(4), motion((0, 0, 0), (0.1, 0, 0))], np.ones(3)) == pytest.approx(0.05)
     old, new = {0: motion((0, 0, 1), (1, 0, 0)), 5: np.eye(4)}, {0: turned, 6: np.eye(4)}
     assert list(changes_of(old, new)) == [0] and np.allclose(changes_of(old, new)[0] @ old[0], turned)
 

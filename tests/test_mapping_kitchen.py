@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import MappingConfig
-from mastd3r.geometry.camera import Camera
 from mastd3r.mapping.mapper import Mapper
 from mastd3r.types import StaticCloud, View
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
+from mastd3r.dynamics.uncertainty import uncertainty_weight
 from mastd3r.mapping.losses import (
     doubted,
     mask_loss,
@@ -17,7 +18,6 @@ from mastd3r.mapping.losses import (
     uncertainty_loss,
 )
 from mastd3r.mapping.ssim import _blur, _blur_torch, ssim_map
-from mastd3r.second_pass import uncertainty_weight
 
 STATIC = torch.tensor([[1.0, 0.5, 0.25, 0.0]])
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import MapLossKind, MappingConfig
 from mastd3r.errors import ConfigError, InputError
-from mastd3r.geometry.camera import Camera
 from mastd3r.mapping.gaussians import GaussianMap
 from mastd3r.mapping.mapper import Mapper
 from mastd3r.mapping.seed import seed_gaussians
@@ -178,37 +178,41 @@ class Bent:
 
 def test_a_loop_correction_of_5_cm_costs_under_half_a_decibel(truth: GaussianMap) -> None:
     """Trained while the keyframes had drifted by 4, 5 and 6 cm; the correction puts them right, nothing restarts."""
-    bent = Bent(truth, 0.04, 0.01)
-    before = bent.quality(bent.drift)
-    bent.mapper.move_keyframes(bent.drift, bent.straight)
-    assert bent.quality(bent.straight) > before - 0.5
-    bent.mapper.refine(20)
-    assert bent.quality(bent.straight) > before - 0.5
+    distorted = Bent(truth, 0.04, 0.01)
+    before = distorted.quality(distorted.drift)
+    distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
+    assert distorted.quality(distorted.straight) > before - 0.5
+    distorted.mapper.refine(20)
+    assert distorted.quality(distorted.straight) > before - 0.5
 
 
 def test_a_room_that_was_bent_by_5_cm_is_straight_again(truth: GaussianMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """Drifted by 0, 5 and 10 cm. Gaussians that all three see have settled between: anchors alone tear them apart."""
-    bent = Bent(truth, 0.0, 0.05)
-    before, trained_map, poses = bent.quality(bent.drift), bent.mapper._map, bent.mapper._view_parameters
-    monkeypatch.setattr(bent.mapper, "_view_parameters", deepcopy(poses))
-    bent.mapper.move_keyframes(bent.drift, bent.straight)
-    after = bent.quality(bent.straight)
-    bent.mapper._map, bent.mapper._view_parameters = trained_map, poses
+    distorted = Bent(truth, 0.0, 0.05)
+    before, trained_map, poses = (
+        distorted.quality(distorted.drift),
+        distorted.mapper._map,
+        distorted.mapper._view_parameters,
+    )
+    monkeypatch.setattr(distorted.mapper, "_view_parameters", deepcopy(poses))
+    distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
+    after = distorted.quality(distorted.straight)
+    distorted.mapper._map, distorted.mapper._view_parameters = trained_map, poses
     monkeypatch.setattr("mastd3r.mapping.mapper.BEND_RATIO", np.inf)
-    bent.mapper.move_keyframes(bent.drift, bent.straight)
-    by_anchors = bent.quality(bent.straight)
+    distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
+    by_anchors = distorted.quality(distorted.straight)
     assert after > before - 0.5 and after > by_anchors + 1
 
 
 def test_a_correction_counts_from_the_cameras_that_the_map_was_trained_with(truth: GaussianMap) -> None:
     """Pose refinement has put the drifted cameras right already: the Gaussians are where they belong and stay there."""
-    bent = Bent(truth, 0.0, 0.05)
-    before, poses = bent.mapper.gaussians.means.copy(), bent.mapper._view_parameters
+    distorted = Bent(truth, 0.0, 0.05)
+    before, poses = distorted.mapper.gaussians.means.copy(), distorted.mapper._view_parameters
     for n in range(12):
-        back = pose(n)[:3, :3].T @ bent.drift[n % 3][:3, 3]
-        poses.correct(n, back / bent.mapper._depth, np.zeros(3))
-    bent.mapper.move_keyframes(bent.drift, bent.straight)
-    moved = np.linalg.norm(bent.mapper.gaussians.means - before, axis=1)
+        back = pose(n)[:3, :3].T @ distorted.drift[n % 3][:3, 3]
+        poses.correct(n, back / distorted.mapper._depth, np.zeros(3))
+    distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
+    moved = np.linalg.norm(distorted.mapper.gaussians.means - before, axis=1)
     assert np.median(moved) < 0.005
 
 

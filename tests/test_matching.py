@@ -152,11 +152,11 @@ def test_descriptor_search_is_what_its_definition_says(exact: tuple[Maps, Maps],
         plain_window(exact[0].descriptors, row, (x, y), radius, dilation)
         for row, (x, y) in zip(wanted, start.tolist(), strict=True)
     ]
-    found, likeness = search_descriptors(exact[0].descriptors, wanted, start.astype(float), options)
+    found, similarity = search_descriptors(exact[0].descriptors, wanted, start.astype(float), options)
     there, again = in_torch.search_descriptors(
         torch.as_tensor(exact[0].descriptors), torch.as_tensor(wanted), torch.as_tensor(start).float(), options
     )
-    for got, alike in ((found, likeness), (there.numpy(), again.numpy())):
+    for got, alike in ((found, similarity), (there.numpy(), again.numpy())):
         assert np.abs(got - plain).max() <= 1
         here = [exact[0].descriptors[y, x] @ row for (x, y), row in zip(plain, wanted, strict=True)]
         np.testing.assert_allclose(alike, here, atol=1e-5)

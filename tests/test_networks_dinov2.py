@@ -20,10 +20,10 @@ transformers = pytest.importorskip("transformers", reason="DINOv2 needs pip inst
 from safetensors.torch import load_file, save_file  # noqa: E402
 
 from helpers import blobs  # noqa: E402
+from mastd3r.download.weights import folder_of  # noqa: E402
+from mastd3r.download.weights_known import KNOWN  # noqa: E402
 from mastd3r.errors import InputError, MissingPackage  # noqa: E402
 from mastd3r.networks.dinov2 import Dinov2Features, cell_centres_px, patch_size_px  # noqa: E402
-from mastd3r.networks.weights import folder_of  # noqa: E402
-from mastd3r.networks.weights_known import KNOWN  # noqa: E402
 
 Array = NDArray[Any]
 

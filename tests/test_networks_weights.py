@@ -16,12 +16,12 @@ import pytest
 from rich.console import Console
 
 from local_server import FileServer, file_server
-from mastd3r import cli_weights
+from mastd3r.cli import weights as cli_weights
+from mastd3r.download.fetch import Interrupted
+from mastd3r.download.weights import absent, check, entries, folder_of, home, installed, path
+from mastd3r.download.weights_download import download
+from mastd3r.download.weights_known import DEFAULT_DINOV2, KNOWN, KnownFile, Licence
 from mastd3r.errors import ConfigError, InputError, SlamError
-from mastd3r.fetch import Interrupted
-from mastd3r.networks.weights import absent, check, entries, folder_of, home, installed, path
-from mastd3r.networks.weights_download import download
-from mastd3r.networks.weights_known import DEFAULT_DINOV2, KNOWN, KnownFile, Licence
 
 TENSORS, PICKLE, SMALL = (np.random.default_rng(seed).bytes(400_000) for seed in range(3))
 CONFIG = b'{"model_type": "dinov2_with_registers"}'

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 
 from helpers import blobs
 from mastd3r import parts
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import Config, NetworksConfig, with_override
+from mastd3r.download import weights
 from mastd3r.dynamics.data import DynamicsInput
 from mastd3r.errors import ConfigError, InputError, SlamError
-from mastd3r.geometry.camera import Camera
-from mastd3r.networks import load, weights
+from mastd3r.networks import load
 from mastd3r.networks.mast3r import Mast3rConfig, random_mast3r
 from mastd3r.networks.pair import PairNetwork
+from mastd3r.offline.smoothing import _at_expected_scale
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host
-from mastd3r.second_pass import _at_expected_scale
 from mastd3r.types import Frame, Guess, Truth
 
 Array = NDArray[Any]

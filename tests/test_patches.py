@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mastd3r.geometry.camera import Camera
+from mastd3r.camera.pinhole import Camera
 from mastd3r.pointmap.flow import FlowMatcher
 from mastd3r.pointmap.patches import SETTLED_PX, align_patches, window
 
@@ -128,11 +128,11 @@ def plain_align(
         return 0.5 * (np.array(after) - np.array(before))
 
     gradient = np.stack([slope(1, 0), slope(0, 1)], 1)
-    at, likeness = np.array(start, float), -1.0
+    at, similarity = np.array(start, float), -1.0
     for _ in range(rounds):
         seen = np.array([bilinear(new, *(at + affine @ o)) for o in offsets])
         v, t = seen - w @ seen, value - w @ value
-        likeness = (w * v) @ t / np.sqrt(((w * v) @ v) * ((w * t) @ t))
+        similarity = (w * v) @ t / np.sqrt(((w * v) @ v) * ((w * t) @ t))
         gain = (w * v) @ t / ((w * t) @ t)
         # seen = gain (T + grad T . step) + bias, with gain and bias free beside the step
         design = np.concatenate([gain * gradient, value[:, None], np.ones((len(w), 1))], 1)
@@ -141,7 +141,7 @@ def plain_align(
         at = at - affine @ step
         if (step**2).sum() < SETTLED_PX**2:
             break
-    return at, float(likeness)
+    return at, float(similarity)
 
 
 @QUICK
@@ -156,13 +156,13 @@ def test_the_kernel_is_its_plain_twin(seed: int) -> None:
     warp = matrix + rng.uniform(-0.03, 0.03, (2, 2))
     rounds = int(rng.integers(1, ROUNDS))
     found, alike = align_patches(ref, new, px, start, warp[None], WINDOW, rounds)
-    wanted, likeness = plain_align(ref, new, px[0], start[0], warp, WINDOW, rounds)
+    wanted, similarity = plain_align(ref, new, px[0], start[0], warp, WINDOW, rounds)
     if alike[0] == -1:  # not settled in so few rounds
         assert rounds < 5
         np.testing.assert_array_equal(found, start)
         return
     np.testing.assert_allclose(found[0], wanted, atol=2e-3)
-    assert alike[0] == pytest.approx(likeness, abs=1e-3)
+    assert alike[0] == pytest.approx(similarity, abs=1e-3)
 
 
 def aligned(ref: Array, new: Array, px: Any, start: Any = None) -> tuple[Array, Array]:

@@ -11,17 +11,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mastd3r.geometry.camera import Camera
+from mastd3r.camera.pinhole import Camera
+from mastd3r.features.orb import OrbFeatures
 from mastd3r.geometry.se3 import inverse, transform
-from mastd3r.pointmap.features import FeatureStart
 from mastd3r.pointmap.flow import FlowMatcher, corner_grid
-from mastd3r.pointmap.geometric import (
-    GeometricPointmaps,
-    SensorDepthPointmaps,
-    sample_own,
-    triangulate,
-    working_size,
-)
+from mastd3r.pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, sample_own, triangulate, working_size
 from mastd3r.sources.synthetic import SyntheticView, room_camera
 from mastd3r.types import Frame, Guess, Matches
 
@@ -132,12 +126,12 @@ def test_matches_outside_the_new_picture_have_no_weight() -> None:
 
 def test_features_start_a_jump() -> None:
     pair = pair_of(turned(np.deg2rad(20)), np.array([45.0, 10.0]))
-    flow = FeatureStart().flow(pair[0], pair[1], None, None)
+    flow = OrbFeatures().flow(pair[0], pair[1], None, None)
     assert flow is not None
     truth = pair[2](GRID) - GRID
     inside = ((pair[2](GRID) > 0) & (pair[2](GRID) < [WIDTH, HEIGHT])).all(-1)
     assert np.median(np.linalg.norm(flow - truth, axis=-1)[inside]) < 1.5
-    assert FeatureStart().flow(pair[0], np.full_like(pair[1], 90), None, None) is None
+    assert OrbFeatures().flow(pair[0], np.full_like(pair[1], 90), None, None) is None
 
 
 def test_features_of_what_moves_have_no_say() -> None:
@@ -148,10 +142,10 @@ def test_features_of_what_moves_have_no_say() -> None:
     ref, new = (np.where(covered > 0, someone, picture) for picture in (ref, new))
     static = covered == 0
     for moving, expected in ((covered, [40.0, 6.0]), (None, [0.0, 0.0])):
-        flow = FeatureStart().flow(ref, new, moving, moving)
+        flow = OrbFeatures().flow(ref, new, moving, moving)
         assert flow is not None
         assert np.linalg.norm(np.median(flow[static], 0) - expected) < 1.5
-    assert FeatureStart().flow(ref, new, np.ones_like(covered), np.ones_like(covered)) is None
+    assert OrbFeatures().flow(ref, new, np.ones_like(covered), np.ones_like(covered)) is None
 
 
 def test_corner_grid_finds_the_corner_of_every_cell() -> None:

@@ -12,20 +12,16 @@ from numpy.typing import NDArray
 from known_pair import Maps, RoomView, decoded, look, truth_of
 from mastd3r.alignment.align import align
 from mastd3r.alignment.reproject import StaticMatches
+from mastd3r.camera.pinhole import Camera
 from mastd3r.config import AlignmentConfig
 from mastd3r.errors import InputError
-from mastd3r.geometry.camera import Camera
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.networks import matching as in_torch
 from mastd3r.networks.mast3r import Mast3rConfig, random_mast3r
 from mastd3r.networks.pair import PairNetwork
 from mastd3r.networks.preprocess import PixelMapping, prepare_image
 from mastd3r.pointmap.geometric import GeometricPointmaps
-from mastd3r.pointmap.mast3r import (
-    Mast3rPointmaps,
-    NetworkFrame,
-    working_size_of,
-)
+from mastd3r.pointmap.mast3r import Mast3rPointmaps, NetworkFrame, working_size_of
 from mastd3r.pointmap.matching import FoundPixels
 from mastd3r.pointmap.network_view import focal_from_points, sample_smooth
 from mastd3r.sources.synthetic import room_camera

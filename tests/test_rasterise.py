@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from gaussian_scenes import HEIGHT, KINDS, NAMES, WIDTH, random_scene, weighted_loss, with_grads
+from mastd3r.concurrency import one_torch_thread
 from mastd3r.errors import InputError, MissingPackage
 from mastd3r.mapping import rasterise
 from mastd3r.mapping.rasterise import map_device, rasterization
 from mastd3r.mapping.rasterise_gsplat import rasterise_gsplat
 from mastd3r.mapping.rasterise_reference import rasterise_reference
 from mastd3r.mapping.screen import ScreenStats
-from mastd3r.mapping.threads import one_torch_thread
 
 
 @pytest.fixture(autouse=True)
@@ -93,7 +93,7 @@ def test_same_bits_for_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) ->
     scene, K = random_scene("plain", 4, count=400)
     results = []
     for threads in (1, 2, 3):
-        monkeypatch.setattr("mastd3r.mapping.threads.thread_count", lambda n=threads: n)
+        monkeypatch.setattr("mastd3r.concurrency.thread_count", lambda n=threads: n)
         results.append(with_grads(rasterization, scene, K))
     for image, grads in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(image, results[0][0], strict=True))

@@ -13,15 +13,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mastd3r import second_pass
-from mastd3r.cli import main
+from mastd3r.camera.map_view import MapView
+from mastd3r.camera.opencv_lens import OpenCvLens, lens_from_intrinsics
+from mastd3r.camera.rectification import Rectifier, rectifier_for
+from mastd3r.cli.main import main
 from mastd3r.config import SourceConfig
 from mastd3r.dynamics.data import DynamicMask, DynamicsInput
 from mastd3r.errors import ConfigError
 from mastd3r.export.report import ReportData, report_html
-from mastd3r.lens_view import LensView
-from mastd3r.rectify import OpenCvLens, RectifiedSource, Rectifier, lens_from_intrinsics, rectifier_for
+from mastd3r.offline import smoothing as smooth_masks
 from mastd3r.sources import open_source, synthetic
+from mastd3r.sources.rectified import RectifiedSource
 from mastd3r.types import Frame, Trajectory
 
 Array = NDArray[Any]
@@ -91,7 +93,7 @@ def test_rays_that_the_lens_folds_back_are_not_in_the_picture() -> None:
     turn = np.sqrt(1 / 0.9)  # d/dr (r - 0.3 r³) = 0
     seen, folded = lens.project(np.array([[0.98 * turn, 0, 1.0], [1.6 * turn, 0, 1.0]]))
     assert 250 < seen[0] < 320 and abs(folded[0]) > 1e5
-    view = LensView(lens_from_intrinsics(BARREL, (376, 240)), 188, 2.0)
+    view = MapView(lens_from_intrinsics(BARREL, (376, 240)), 188, 2.0)
     straight = view.pinhole_image(np.full((240, 376, 3), 255, np.uint8))[1]
     edges = [straight[0, 0], straight[0, -1], straight[-1, 0], straight[-1, -1]]
     assert max(edges) == 0 and 0.6 < straight.mean() < 0.95
@@ -104,7 +106,7 @@ def test_rays_that_the_lens_folds_back_are_not_in_the_picture() -> None:
 def test_every_pixel_lands_where_opencv_puts_it(name: str) -> None:
     """Pictures of coordinates: pixel → rectified → OpenCV's projection agrees to 0.05 px, and the way back."""
     r, (given, size) = rectifier(name), LENSES[name]
-    assert r.pinhole.fx_px == r.pinhole.fy_px == pytest.approx(np.sqrt(given[0] * given[1])) and not r.pinhole.bent
+    assert r.pinhole.fx_px == r.pinhole.fy_px == pytest.approx(np.sqrt(given[0] * given[1])) and not r.pinhole.distorted
     x, y = (r.semantic(a.astype(np.float32)) for a in np.indices(size[::-1])[::-1])
     truth = opencv(r.pinhole.rays(r.pinhole.pixel_grid()).reshape(-1, 3), given)
     assert x.shape == y.shape == r.size[::-1]
@@ -184,7 +186,7 @@ def test_a_source_is_rectified_but_for_its_truth(room_clip: Path) -> None:
 @pytest.mark.parametrize("name", ["barrel", "cushion"])
 def test_a_photograph_survives_the_map_s_pinhole(name: str) -> None:
     given, size = LENSES[name]
-    view = LensView(lens_from_intrinsics(given, size), size[0] // 2, 2.0)
+    view = MapView(lens_from_intrinsics(given, size), size[0] // 2, 2.0)
     y, x = np.mgrid[0 : size[1], 0 : size[0]]
     photograph = np.rint(127 + 60 * np.stack([np.sin(x / 9), np.cos(y / 7), np.sin((x + y) / 11)], -1)).astype(np.uint8)
     small = cv2.resize(photograph, (view.camera.width, view.camera.height), interpolation=cv2.INTER_AREA) / 255
@@ -298,10 +300,10 @@ def test_a_calibrated_bent_lens_is_as_good_as_a_straight_one(track: Callable[...
     """ATE within 1.5 times that of the pinhole, and far below that of the same lens without its distortion."""
     straight = figures(track("straight", (225, 225, 119.5, 89.5), "--no-map"))
     run = track("bent", ROOM, "--no-map")
-    bent, ignored = figures(run), figures(track("bent", ROOM[:4], "--no-map"))
-    assert bent["frames_posed"] == 24
-    assert bent["ate_rmse_all"] < 1.5 * straight["ate_rmse_all"]
-    assert bent["ate_rmse_all"] < 0.3 * ignored["ate_rmse_all"]
+    distorted, ignored = figures(run), figures(track("bent", ROOM[:4], "--no-map"))
+    assert distorted["frames_posed"] == 24
+    assert distorted["ate_rmse_all"] < 1.5 * straight["ate_rmse_all"]
+    assert distorted["ate_rmse_all"] < 0.3 * ignored["ate_rmse_all"]
     camera, record = json.loads((run / "camera.json").read_text()), json.loads((run / "run.json").read_text())
     assert [camera[k] for k in ("fx_px", "fy_px", "cx_px", "cy_px", "width", "height")] == [*ROOM[:4], *ROOM_SIZE]
     assert (camera["k1"], camera["k2"], camera["k3"]) == (-0.28, 0.09, 0.0)
@@ -310,7 +312,7 @@ def test_a_calibrated_bent_lens_is_as_good_as_a_straight_one(track: Callable[...
     words = (run / "colmap" / "cameras.txt").read_text().splitlines()[1].split()
     assert words[1] == "OPENCV" and [float(w) for w in words[4:]] == [225, 220.5, 123.5, 87.5, *ROOM[4:]]
     assert record["camera"]["distortion"] == list(ROOM[4:]) and record["camera"]["found"] == "given"
-    assert bent["focal_px"] == record["camera"]["focal_px"] == pytest.approx(np.sqrt(ROOM[0] * ROOM[1]))
+    assert distorted["focal_px"] == record["camera"]["focal_px"] == pytest.approx(np.sqrt(ROOM[0] * ROOM[1]))
     assert any(c.startswith("lens: photographs rectified to a pinhole of 222.7 px") for c in record["choices"])
     assert "225.0\n  - 220.5" in (run / "config.yaml").read_text()  # what was given, not what was made of it
 
@@ -337,7 +339,7 @@ def test_masks_come_back_in_pixels_of_the_photograph(
                 assert given.gray.shape == known.shape  # this clip is small: tracking shrinks nothing
                 yield DynamicMask(known, known > 0.5, {})
 
-    monkeypatch.setattr(second_pass, "TwoWayBelief", Known)
+    monkeypatch.setattr(smooth_masks, "ForwardBackwardSmoother", Known)
     files = sorted((track("bent", ROOM, "--no-map") / "masks").iterdir())
     assert len(files) == 24
     mask = cv2.imread(str(files[5]), cv2.IMREAD_UNCHANGED)
@@ -357,8 +359,8 @@ def test_renders_are_photographs_of_the_bent_lens(track: Callable[..., Path], cl
         render, photograph = cv2.imread(str(file)), cv2.imread(str(clips["bent"] / "rgb" / file.name))
         assert render is not None and photograph is not None and render.shape == (90, 120, 3)
         straight = cv2.resize(r.image(photograph), (120, 90), interpolation=cv2.INTER_AREA)
-        bent = cv2.resize(photograph, (120, 90), interpolation=cv2.INTER_AREA)
-        assert cv2.PSNR(render, bent) > cv2.PSNR(render, straight) + 1
+        distorted = cv2.resize(photograph, (120, 90), interpolation=cv2.INTER_AREA)
+        assert cv2.PSNR(render, distorted) > cv2.PSNR(render, straight) + 1
 
 
 # -- what the report says ----------------------------------------------------------------------------------------------

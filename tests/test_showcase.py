@@ -14,7 +14,7 @@ from mastd3r.export.run_folder import write_depth_png
 from mastd3r.export.video import write_video
 from mastd3r.geometry.path import smoothed_path
 from mastd3r.geometry.se3 import se3_exp
-from mastd3r.showcase import FLIGHT_FPS, depth_png_per_unit, flight_path
+from mastd3r.offline.renders import FLIGHT_FPS, depth_png_per_unit, flight_path
 
 
 def still_and_moving(count: int = 40) -> tuple[np.ndarray, np.ndarray]:

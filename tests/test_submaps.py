@@ -11,11 +11,12 @@ import pytest
 from numpy.typing import NDArray
 
 from mastd3r.config import CameraConfig, Config, GraphConfig, TrackingConfig
-from mastd3r.finish import FinalFrame, final_frames, finish_graph
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import Sim3, procrustes
-from mastd3r.graph.keyframe_graph import KeyframeGraph, lens_for
+from mastd3r.graph.intrinsics import intrinsics_for
+from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.submaps import bridge_submaps, join, scale_between
+from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph
 from mastd3r.parts import Parts, build_parts
 from mastd3r.slam import Slam, StepReport
 from mastd3r.sources import synthetic
@@ -41,7 +42,7 @@ def keyframe(
     work = replace(scene.work_frame(view), timestamp_s=time_s)
     moving = np.zeros((scene.height, scene.width))
     kf = graph.add_keyframe(work, np.ones(p), moving, cam_from_world, inv_depth, 1e-2 / inv_depth**2)
-    graph.blocks[kf.id].depth_info = 1e6 / inv_depth**2  # sure to a thousandth
+    graph.variables[kf.id].depth_info = 1e6 / inv_depth**2  # sure to a thousandth
     graph.record(work, kf.id, np.eye(4), "tracked", None, np.zeros(0))
     graph.replace_last_by_keyframe(kf)
     return kf.id
@@ -50,8 +51,8 @@ def keyframe(
 def cut_graph(scene: Any, scale: float = SCALE, b_from_a: Array = B_FROM_A) -> KeyframeGraph:
     """True keyframes 0 … 4 in one world, 5 … 9 in another one with lengths of its own; a frame hangs on 2 and on 7."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
-    graph.lens.g, graph.lens.prior = scene.lens.copy(), scene.lens.copy()
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
     for k in range(VIEWS):
         if k == CUT:
             graph.start_submap()
@@ -87,9 +88,9 @@ def test_a_cut_graph_is_two_submaps(scene: Any) -> None:
     assert graph.members(0) == [0, 1, 2, 3, 4] and graph.members(1) == graph.members() == [5, 6, 7, 8, 9]
     assert graph.roots() == [0, 5] and graph.started == {0, 1} and graph.initialised
     part = graph.part()
-    assert [kf.id for kf in part.keyframes] == [5, 6, 7, 8, 9] and list(part.blocks) == [5, 6, 7, 8, 9]
+    assert [kf.id for kf in part.keyframes] == [5, 6, 7, 8, 9] and list(part.variables) == [5, 6, 7, 8, 9]
     assert {(e.i, e.j) for e in part.edges} == {(i, j) for i in range(5, 10) for j in (i - 1, i + 1) if 5 <= j < 10}
-    assert part.blocks[6] is graph.blocks[6] and all(r.kf_id >= CUT for r in part.records)
+    assert part.variables[6] is graph.variables[6] and all(r.kf_id >= CUT for r in part.records)
     assert graph.connected(1, 2) and not graph.connected(4, 5)
 
 
@@ -106,8 +107,8 @@ def test_the_scale_between_two_submaps(scene: Any, i: int, j: int, scale: float)
 def test_a_third_of_wrong_matches_does_not_move_the_scale(scene: Any) -> None:
     graph, matches = cut_graph(scene), scene.matches(4, 5)
     wrong = np.random.default_rng(0).random(len(scene.px)) < 0.33
-    graph.blocks[4].inv_depth = np.where(wrong, 0.3, 1.0) * graph.blocks[4].inv_depth
-    graph.blocks[4].depth_info = graph.blocks[4].depth_info * 100
+    graph.variables[4].inv_depth = np.where(wrong, 0.3, 1.0) * graph.variables[4].inv_depth
+    graph.variables[4].depth_info = graph.variables[4].depth_info * 100
     found = scale_between(graph, 4, 5, scene.j_from_i(4, 5), matches, matches.weight)
     assert found == pytest.approx(SCALE, rel=0.05)
 
@@ -118,8 +119,8 @@ def test_no_scale_where_too_little_is_known(scene: Any) -> None:
     assert scale_between(cut_graph(scene), 4, 5, *args, np.zeros(len(scene.px))) is None
     for unknown in (4, 5):
         graph = cut_graph(scene)
-        graph.blocks[unknown].depth_info = np.zeros(len(scene.px))
-        graph.blocks[unknown].prior_info = np.full(len(scene.px), 1e-6)
+        graph.variables[unknown].depth_info = np.zeros(len(scene.px))
+        graph.variables[unknown].prior_info = np.full(len(scene.px), 1e-6)
         assert scale_between(graph, 4, 5, *args, matches.weight) is None
     few = matches.weight * (np.cumsum(matches.weight) <= 19)
     assert scale_between(cut_graph(scene), 4, 5, *args, few) is None
@@ -129,14 +130,14 @@ def test_no_scale_where_too_little_is_known(scene: Any) -> None:
 def test_joining_puts_everything_where_it_belongs(scene: Any, current: int) -> None:
     graph = cut_graph(scene)
     graph.submap = current
-    info = graph.blocks[7].depth_info.copy() * graph.blocks[7].inv_depth ** 2
-    graph.blocks[8].prior_depth = 1.1 * graph.blocks[8].inv_depth
+    info = graph.variables[7].depth_info.copy() * graph.variables[7].inv_depth ** 2
+    graph.variables[8].prior_depth = 1.1 * graph.variables[8].inv_depth
     join(graph, 3, 6, scene.j_from_i(3, 6), SCALE)
     for k in range(VIEWS):
         np.testing.assert_allclose(graph.world_from_cam(k), world_from(scene, k), atol=1e-6)
-        np.testing.assert_allclose(graph.blocks[k].inv_depth, 1 / scene.depth(k), rtol=1e-9)
-    np.testing.assert_allclose(graph.blocks[8].prior_depth, 1.1 / scene.depth(8), rtol=1e-9)
-    np.testing.assert_allclose(graph.blocks[7].depth_info * graph.blocks[7].inv_depth ** 2, info, rtol=1e-9)
+        np.testing.assert_allclose(graph.variables[k].inv_depth, 1 / scene.depth(k), rtol=1e-9)
+    np.testing.assert_allclose(graph.variables[8].prior_depth, 1.1 / scene.depth(8), rtol=1e-9)
+    np.testing.assert_allclose(graph.variables[7].depth_info * graph.variables[7].inv_depth ** 2, info, rtol=1e-9)
     step = se3_exp(np.array([0.02, 0.01, -0.03, 0.01, 0.02, 0.0]))
     hanging = [r for r in graph.records if not r.is_keyframe]
     assert [r.kf_id for r in hanging] == [2, 7]
@@ -157,14 +158,14 @@ def test_a_join_changes_no_residual_within_either_part(scene: Any) -> None:
 
 def test_roots_hold_every_submap_where_it_is(scene: Any) -> None:
     graph = cut_graph(scene)
-    before = [graph.blocks[k].cam_from_world.copy() for k in graph.roots()]
+    before = [graph.variables[k].cam_from_world.copy() for k in graph.roots()]
     rng = np.random.default_rng(0)
     for k in (2, 7):
-        graph.blocks[k].cam_from_world = se3_exp(rng.normal(0, 0.01, 6)) @ graph.blocks[k].cam_from_world
+        graph.variables[k].cam_from_world = se3_exp(rng.normal(0, 0.01, 6)) @ graph.variables[k].cam_from_world
     report = graph.solve_all(10, 1.0)
     assert report.cost_last < 0.01 * report.cost_first
     for k, pose in zip(graph.roots(), before, strict=True):
-        np.testing.assert_allclose(graph.blocks[k].cam_from_world[:3, :3], pose[:3, :3], atol=1e-12)
+        np.testing.assert_allclose(graph.variables[k].cam_from_world[:3, :3], pose[:3, :3], atol=1e-12)
 
 
 # -- dropping and bridging -----------------------------------------------------------------------------------------
@@ -174,7 +175,7 @@ def test_dropping_the_newest_submap_leaves_contiguous_numbers(scene: Any) -> Non
     graph = cut_graph(scene)
     records = list(graph.records)
     graph.drop_submap()
-    assert [kf.id for kf in graph.keyframes] == list(range(CUT)) == sorted(graph.blocks) == sorted(graph.submap_of)
+    assert [kf.id for kf in graph.keyframes] == list(range(CUT)) == sorted(graph.variables) == sorted(graph.submap_of)
     assert all(e.i < CUT and e.j < CUT for e in graph.edges) and len(graph.edges) == 8
     assert graph.records == records and graph.started == {0} and not graph.initialised
     for r in records:
@@ -195,8 +196,8 @@ def steady(k: float) -> Array:
 def steady_graph(scene: Any, gap: int) -> KeyframeGraph:
     """Keyframes 0 … 9 of a steady camera, ``gap`` frames missing after the fifth; the rest is in a world of its own."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), lens_for(CameraConfig(), *size, size))
-    graph.lens.g = scene.lens.copy()
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values = scene.lens.copy()
     inv_depth = np.full(len(scene.px), 0.4)
     for k in range(VIEWS):
         if k == CUT:

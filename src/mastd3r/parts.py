@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .concurrency import prefetch
 from .config import Config, MappingConfig, NetworksConfig
-from .dynamics.head import plain_descriptors
+from .download import weights
+from .dynamics.appearance import plain_descriptors
 from .errors import ConfigError, InputError
-from .graph.places import PlaceIndex
-from .lookahead import ahead
-from .networks import weights
+from .features.orb import OrbFeatures
+from .graph.place_recognition import PlaceRecognition
 from .pointmap.base import PointmapProvider
-from .pointmap.features import FeatureStart
 from .pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, working_size
 from .types import Frame, Source, WorkFrame
 
@@ -35,12 +35,12 @@ class Parts:
 
     provider: PointmapProvider
     size: tuple[int, int]  # (width, height) of the working image
-    features: FeatureStart = field(default_factory=FeatureStart)
-    places: PlaceIndex = field(default_factory=PlaceIndex)
+    features: OrbFeatures = field(default_factory=OrbFeatures)
+    places: PlaceRecognition = field(default_factory=PlaceRecognition)
     notes: list[str] = field(default_factory=list)
     semantic: Callable[[Frame], Frame] | None = None  # fills Frame.semantic; None: what the source brings
     own_scale_known: bool = True  # False: the depth of every frame alone has a scale of its own
-    pairs_ahead: bool = False  # the provider decodes a frame's pair before its turn, beside the keyframe of that time
+    prefetches_pairs: bool = False  # the provider decodes a frame's pair before its turn, beside the anchor
     descriptors: Callable[[Frame], Array] | None = None  # (h', w', c) of a network; None: plain descriptors
 
     def __post_init__(self) -> None:
@@ -62,13 +62,13 @@ class Parts:
             return self.descriptors(frame)
         return plain_descriptors(frame.image, self.size[0] // DESCRIBED_PX, self.size[1] // DESCRIBED_PX)
 
-    def frames_ahead(self, frames: Iterator[Frame], near: Callable[[], Near]) -> Iterator[Frame]:
+    def prefetched(self, frames: Iterator[Frame], near: Callable[[], Near]) -> Iterator[Frame]:
         """The frames, each read, and looked at for ``observe``, while the caller works on the one before.
 
         ``near`` is asked in the caller's thread, a frame ahead: the frame that ``observe`` will probably be given.
         """
-        looked = ahead(frames, lambda frame, _: self._foresee(frame), lambda: None)
-        return ahead(looked, self._foresee_beside, near) if self.pairs_ahead else looked
+        looked = prefetch(frames, lambda frame, _: self._foresee(frame), lambda: None)
+        return prefetch(looked, self._foresee_beside, near) if self.prefetches_pairs else looked
 
     def _look(self, frame: Frame) -> WorkFrame:
         return self.provider.look(frame if self.semantic is None else self.semantic(frame))
@@ -206,9 +206,9 @@ def _mast3r(config: Config, source: Source) -> Parts:
     options: dict[str, Any] = {"remembered_pairs": most, "depth_sigma_ratio": c.depth_sigma_ratio}
     provider = Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, **options)
     note = f"MASt3R: {path.name} of {c.mast3r}, {precision} on {device}, {execution}, working image {width}x{height}"
-    places = PlaceIndex(provider.place_descriptor)
+    places = PlaceRecognition(provider.place_descriptor)
     parts = Parts(provider, (width, height), places=places, notes=[note], own_scale_known=False)
-    parts.pairs_ahead = device != "cpu"  # there the main loop needs the processor itself
+    parts.prefetches_pairs = device != "cpu"  # there the main loop needs the processor itself
     return parts
 
 

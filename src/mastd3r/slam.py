@@ -9,35 +9,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .compare import THIN, Comparer, TwoView, matched_share
+from .concurrency import Future, Worker
 from .config import Config
-from .dynamics.belief import DynamicBelief
+from .dynamics.filter import LogOddsFilter
+from .dynamics.soft_mask import grown, static_at
 from .geometry.se3 import inverse
-from .graph.bootstrap import bootstrap
-from .graph.bundle import Lens
-from .graph.keyframe_graph import Keyframe, KeyframeGraph, lens_for
-from .graph.places import nearest_keyframe
+from .graph.covisibility import nearest_keyframe
+from .graph.initialisation import bootstrap
+from .graph.intrinsics import Intrinsics, intrinsics_for
+from .graph.keyframe_graph import Keyframe, KeyframeGraph
+from .graph.prediction import rigid_flow_to
 from .graph.submaps import join, scale_between
-from .links import Links
-from .lookahead import Beside, Later
-from .loops import close_loops, widen
 from .parts import Near, Parts
+from .pointmap.flow_maps import invert_flow
 from .pointmap.mast3r import NetworkFrame
 from .sources.checks import frame_is_blank
+from .tracking.covisibility import CovisibilityEdges
+from .tracking.depth_prior import own_depth_prior, predicted_depth
+from .tracking.loop_closure import close_loops, widen
+from .tracking.mask_input import dynamics_input
+from .tracking.two_view import THIN, TwoView, TwoViewEstimator, matched_share
 from .types import Frame, State, WorkFrame
-from .view_depth import (
-    dynamics_input,
-    grown,
-    invert_flow,
-    own_depth_prior,
-    predicted_depth,
-    rigid_flow_to,
-    static_at,
-)
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
-TIED_AFTER = 4  # frames after a keyframe until its ties are taken: at the same frame however fast they were made
+EDGES_AFTER = 4  # frames after a keyframe until its ties are taken: at the same frame however fast they were made
 LEAST_MOTION_RATIO = 0.04  # of sqrt(width * height): from the same place a nearer keyframe sees no more of the scene
 FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 
@@ -54,14 +50,14 @@ class StepReport:
     why: str
 
 
-def started_at(lens: Lens, work: WorkFrame, size: tuple[int, int]) -> Lens:
+def started_at(lens: Intrinsics, work: WorkFrame, size: tuple[int, int]) -> Intrinsics:
     """The lens with the focal length that the frame's own points speak of, where they do and a camera may have it."""
     focal_px = work.focal_px if isinstance(work, NetworkFrame) else None
     low, high = FOCAL_RATIOS_BELIEVED
     if focal_px is None or not low < focal_px / np.sqrt(size[0] * size[1]) < high:
         return lens
-    g = np.concatenate([[np.log(focal_px)], lens.g[1:]])
-    return Lens(g, g.copy(), lens.prior_info)
+    g = np.concatenate([[np.log(focal_px)], lens.values[1:]])
+    return Intrinsics(g, g.copy(), lens.prior_info)
 
 
 class Slam:
@@ -70,18 +66,18 @@ class Slam:
     def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
         self.config, self.parts = config, parts
         width, height = parts.size
-        self.graph = KeyframeGraph(config.graph, lens_for(config.camera, width, height, full_size))
+        self.graph = KeyframeGraph(config.graph, intrinsics_for(config.camera, width, height, full_size))
         self.graph.size = parts.size  # a run without a single keyframe still has a lens
-        self.belief = DynamicBelief(config.dynamics, width, height)
-        self.comparer = Comparer(config, parts, self.graph)
-        self._mask = Beside("mask")  # the belief lives in its thread: it is updated while the next frame is matched
-        self.links = Links(config.graph, parts)
-        self._tying = Beside("ties")
-        self._tied: Later[KeyframeGraph] | None = None  # the graph with the newest keyframe's ties, not yet taken
+        self.belief = LogOddsFilter(config.dynamics, width, height)
+        self.comparer = TwoViewEstimator(config, parts, self.graph)
+        self._mask = Worker("mask")  # the belief lives in its thread: it is updated while the next frame is matched
+        self.links = CovisibilityEdges(config.graph, parts)
+        self._tying = Worker("ties")
+        self._tied: Future[KeyframeGraph] | None = None  # the graph with the newest keyframe's ties, not yet taken
         self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
         self._before_loss: Keyframe | None = None  # the same, when the camera was lost
         self._flow: Array | None = None  # ref -> last frame
-        self._last: tuple[WorkFrame, Later[Array]] | None = None  # last tracked frame and its P(moving)
+        self._last: tuple[WorkFrame, Future[Array]] | None = None  # last tracked frame and its P(moving)
         self._cam_from_ref = np.eye(4)  # of the last tracked frame
         self._most_matched = 0  # by any frame since ref was chosen
         self._keyframe_at = 0  # records there were when the newest keyframe was tied
@@ -93,13 +89,13 @@ class Slam:
 
     def step(self, frame: Frame) -> StepReport:
         """Track one frame (III-A, III-B); keyframes extend the graph."""
-        if len(self.graph.records) - self._keyframe_at >= TIED_AFTER:
+        if len(self.graph.records) - self._keyframe_at >= EDGES_AFTER:
             self._settle()
         work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
         if frame_is_blank(frame.image):
             return self._lost(work, "the image is blank")
-        looks = self._mask.later(lambda: self.parts.describe(frame) if self.config.dynamics.use_head else None)
-        prior = self._mask.later(
+        looks = self._mask.submit(lambda: self.parts.describe(frame) if self.config.dynamics.use_head else None)
+        prior = self._mask.submit(
             lambda: grown(self.belief.prior(work.gray, work.semantic, looks.get()))
         )  # prior of (2)
         if self._ref is None:
@@ -118,7 +114,7 @@ class Slam:
             kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
         return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
 
-    def _find(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
+    def _find(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
         """The frame against the keyframe that is followed; a young submap first looks for the map that was lost."""
         assert self._ref is not None
         if not self.graph.initialised and self.graph.started:
@@ -126,12 +122,12 @@ class Slam:
             if view is not None:
                 return view
         view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
-        if not self.comparer.believed(view):
+        if not self.comparer.accepted(view):
             return None
         thin = matched_share(self._ref, view.weight) < THIN
         return self._from_nearer(work, prior, view) if thin else view
 
-    def _from_nearer(self, work: WorkFrame, prior: Later[Array], view: TwoView) -> TwoView:
+    def _from_nearer(self, work: WorkFrame, prior: Future[Array], view: TwoView) -> TwoView:
         """Few matches are left: the last good frame becomes a keyframe, so that the chain has no weak link."""
         before, most = self._ref, self._most_matched
         assert before is not None
@@ -143,15 +139,15 @@ class Slam:
         self._follow(before, view, most)
         return view
 
-    def _from_last(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
+    def _from_last(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
         """The last good frame becomes a keyframe, which is followed from here on; the frame seen from it, if it is."""
         last = self._last
         if last is None or self._flow is None or self.graph.records[-1].state != "tracked":
             return None
         near = self.comparer.compare(self._promote_last(*last), work, prior, None, np.eye(4))
-        return near if self.comparer.believed(near) else None
+        return near if self.comparer.accepted(near) else None
 
-    def _rejoin(self, work: WorkFrame, prior: Later[Array]) -> TwoView | None:
+    def _rejoin(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
         graph = self.graph
         ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
@@ -159,7 +155,7 @@ class Slam:
         if self._before_loss is not None:
             candidates = [self._before_loss, *(kf for kf in candidates if kf.id != self._before_loss.id)]
         for kf in candidates:
-            view = self.comparer.recognised(kf, work, prior)
+            view = self.comparer.relocalised(kf, work, prior)
             if view is not None:
                 log.info("frame %d found again from keyframe %d", work.index, kf.id)
                 graph.drop_submap()
@@ -169,7 +165,7 @@ class Slam:
                 return view
         return None
 
-    def _retry(self, work: WorkFrame, prior: Later[Array]) -> tuple[Keyframe, TwoView | None]:
+    def _retry(self, work: WorkFrame, prior: Future[Array]) -> tuple[Keyframe, TwoView | None]:
         """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
         near, graph = self._from_last(work, prior), self.graph
         assert self._ref is not None
@@ -177,7 +173,7 @@ class Slam:
             return self._ref, near
         places = self.parts.places.best(graph, work, graph.members())
         for kf in [self._ref, *(p for p in places if p.id != self._ref.id)]:
-            view = self.comparer.recognised(kf, work, prior)
+            view = self.comparer.relocalised(kf, work, prior)
             if view is not None:
                 log.info("frame %d found again from keyframe %d", work.index, kf.id)
                 return kf, view
@@ -198,7 +194,7 @@ class Slam:
             view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
             t = self.config.tracking
             enough = 0.3 * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
-            if self.comparer.believed(view) and view.motion_ratio > enough:
+            if self.comparer.accepted(view) and view.motion_ratio > enough:
                 self._add_keyframe(work, moving, view)
         if graph.started and graph.keyframes and not graph.initialised and not bootstrap(graph):
             graph.drop_submap()
@@ -213,10 +209,10 @@ class Slam:
 
     # -- keyframes -------------------------------------------------------------------------------------------
 
-    def _start(self, work: WorkFrame, prior: Later[Array], why: str) -> StepReport:
+    def _start(self, work: WorkFrame, prior: Future[Array], why: str) -> StepReport:
         graph = self.graph
         if not graph.started and not self.config.camera.intrinsics:
-            graph.lens = started_at(graph.lens, work, graph.size)
+            graph.intrinsics = started_at(graph.intrinsics, work, graph.size)
         sigma = self.parts.provider.depth_sigma_ratio
         inv_depth, info = own_depth_prior(work, 1.0, sigma)
         kf = graph.add_keyframe(work, static_at(prior.get(), work.px), prior.get(), np.eye(4), inv_depth, info)
@@ -228,7 +224,7 @@ class Slam:
         self._last = (work, prior)
         return StepReport(work.index, work.timestamp_s, "started", kf.id, True, why)
 
-    def _start_again(self, work: WorkFrame, prior: Later[Array]) -> StepReport:
+    def _start_again(self, work: WorkFrame, prior: Future[Array]) -> StepReport:
         """The camera is lost: what follows is a submap of its own until it is recognised."""
         self._settle()
         graph, ref = self.graph, self._ref
@@ -250,20 +246,20 @@ class Slam:
         # something that passes in front thins the matches too, but from the same place nothing is gained
         return view.motion_ratio > enough or (thin and view.motion_ratio > 0.4 * enough)
 
-    def _changes_to_known(self, work: WorkFrame, moving: Later[Array]) -> bool:
+    def _changes_to_known(self, work: WorkFrame, moving: Future[Array]) -> bool:
         """Where an older keyframe sees the same from nearby, frames hang on that one, and nothing is added."""
         graph, ref, t = self.graph, self._ref, self.config.tracking
         assert ref is not None
         if not graph.initialised:
             return False
-        cam_from_world = self._cam_from_ref @ graph.blocks[ref.id].cam_from_world
+        cam_from_world = self._cam_from_ref @ graph.variables[ref.id].cam_from_world
         near = nearest_keyframe(graph, cam_from_world, ref.id, t.known_overlap_ratio, t.known_motion_ratio)
         if near is None:
             return False
-        kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.blocks[near].cam_from_world)
+        kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.variables[near].cam_from_world)
         view = self.comparer.compare(kf, work, moving, rigid_flow_to(graph, near, cam_from_world), guess)
         alike = view.motion_ratio <= t.keyframe_motion_ratio and matched_share(kf, view.weight) >= 0.4
-        if not self.comparer.believed(view) or not alike:
+        if not self.comparer.accepted(view) or not alike:
             return False
         if abs(near - ref.id) > 1 and not graph.connected(near, ref.id):
             self._settle()
@@ -273,17 +269,17 @@ class Slam:
         self._follow(kf, view, view.matched)
         return True
 
-    def _promote_last(self, work: WorkFrame, moving: Later[Array]) -> Keyframe:
+    def _promote_last(self, work: WorkFrame, moving: Future[Array]) -> Keyframe:
         assert self._ref is not None
         prior_view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
         return self._add_keyframe(work, moving, prior_view)
 
-    def _add_keyframe(self, work: WorkFrame, moving: Later[Array], view: TwoView) -> Keyframe:
+    def _add_keyframe(self, work: WorkFrame, moving: Future[Array], view: TwoView) -> Keyframe:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
         self._settle()
         graph, before = self.graph, self._ref
         assert before is not None
-        cam_from_world = view.alignment.new_from_ref @ graph.blocks[before.id].cam_from_world
+        cam_from_world = view.alignment.new_from_ref @ graph.variables[before.id].cam_from_world
         sigma = self.parts.provider.depth_sigma_ratio
         inv_depth, info = predicted_depth(graph, before.id, cam_from_world, work, view.alignment.scale, sigma)
         mask = moving.get()
@@ -307,13 +303,13 @@ class Slam:
         """Tie a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
         graph = self.graph
         everything = len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256)
-        hurry = len(graph.records) - self._keyframe_at < TIED_AFTER  # the next may come before they are made
+        hurry = len(graph.records) - self._keyframe_at < EDGES_AFTER  # the next may come before they are made
         self._keyframe_at = len(graph.records)
         alone = graph.window_is_all or everything or hurry or len(graph.started) > 1
         if self.parts.provider.side_by_side and not alone:
             graph.solve_depths(kf.id)
             aside = graph.aside()
-            self._tied = self._tying.later(lambda: self.links.tie(aside, kf, before))
+            self._tied = self._tying.submit(lambda: self.links.tie(aside, kf, before))
             return
         self.links.tie(graph, kf, before)
         if not (len(graph.started) > 1 and self._joins(kf)) and everything:
@@ -331,7 +327,7 @@ class Slam:
         own = graph.submap_of[kf.id]
         others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
         for other in self.parts.places.best(graph, kf.work, others):
-            view = self.comparer.recognised(other, kf.work, Later.known(kf.moving / 255.0))
+            view = self.comparer.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
             if view is None:
                 continue
             pose = view.alignment.new_from_ref
@@ -348,13 +344,13 @@ class Slam:
         return False
 
     def _update_belief(
-        self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Later[Array], looks: Later[Array | None]
-    ) -> Later[Array]:
+        self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Future[Array], looks: Future[Array | None]
+    ) -> Future[Array]:
         if not self.graph.initialised:
             return prior
-        cam_from_world = view.alignment.new_from_ref @ self.graph.blocks[kf.id].cam_from_world
+        cam_from_world = view.alignment.new_from_ref @ self.graph.variables[kf.id].cam_from_world
         given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
-        return self._mask.later(lambda: grown(self.belief.update(replace(given, features=looks.get())).probability))
+        return self._mask.submit(lambda: grown(self.belief.update(replace(given, features=looks.get())).probability))
 
     def _lost(self, work: WorkFrame, why: str) -> StepReport:
         """Nothing can be seen: the frame has no place, and the next one is looked for where the last one was."""

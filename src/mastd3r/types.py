@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.camera import Camera
+from .camera.pinhole import Camera
 
 Array = NDArray[Any]
 State = Literal["started", "tracked", "interpolated", "lost"]
@@ -51,7 +51,9 @@ class Source(Protocol):
     notes: list[str]  # choices and warnings, for the log and run.json
     has_depth: bool  # frames() can carry depth_m
     has_semantic: bool  # frames() can carry semantic
-    calibration: tuple[float, ...]  # what the dataset says of its lens, as --intrinsics; empty: nothing. See run.py
+    calibration: tuple[
+        float, ...
+    ]  # what the dataset says of its lens, as --intrinsics; empty: nothing. See reconstruct.py
 
     def frames(self) -> Iterator[Frame]: ...
     def truth(self) -> Truth | None: ...

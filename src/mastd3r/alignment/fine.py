@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..geometry.gauss_newton import damped_solve
-from ..geometry.point_system import point_system
-from ..geometry.reprojection import pose_system
+from ..geometry.least_squares import damped_solve
+from ..geometry.point_kernels import point_system
+from ..geometry.reprojection_kernels import pose_system
 from ..geometry.se3 import se3_exp, transform
 from .reproject import PoseReport, StaticMatches
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.gauss_newton import damped_solve
-from ..geometry.reprojection import MIN_DEPTH, edge_residuals, pose_system
+from ..geometry.least_squares import damped_solve
+from ..geometry.reprojection_kernels import MIN_DEPTH, edge_residuals, pose_system
 from ..geometry.se3 import se3_exp
 
 Array = NDArray[Any]

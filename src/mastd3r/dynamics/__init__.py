@@ -1,7 +1,7 @@
 """What moves and what does not (paper III-A)."""
 
-from .belief import DynamicBelief
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
+from .filter import LogOddsFilter
 
-__all__ = ["DynamicBelief", "DynamicMask", "DynamicsConfig", "DynamicsInput"]
+__all__ = ["DynamicMask", "DynamicsConfig", "DynamicsInput", "LogOddsFilter"]

@@ -7,7 +7,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 
 Array = NDArray[Any]
 

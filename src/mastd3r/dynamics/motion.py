@@ -11,7 +11,7 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 from .config import DynamicsConfig
 
 Array = NDArray[Any]
@@ -37,7 +37,7 @@ def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Arr
     x, y = x * scale, y * scale
     dx, dy = (m[0, 3] - x * m[2, 3]) * scale, (m[1, 3] - y * m[2, 3]) * scale
     u, v = x, y
-    if camera.bent:
+    if camera.distorted:
         r2 = x * x + y * y
         bend = 1 + r2 * (camera.k1 + r2 * (camera.k2 + camera.k3 * r2))
         pull = 2 * (camera.k1 + r2 * (2 * camera.k2 + 3 * camera.k3 * r2)) * (x * dx + y * dy)
@@ -96,7 +96,7 @@ def flow_covariance(information: Information, base_px: float, widest_px: float) 
     return cv2.merge([yy / det + base_px**2, -xy / det, xx / det + base_px**2])
 
 
-def doubt_of_fit(residual: Array, cov: Array, weight: Array) -> float:
+def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
     """Factor >= 1 by which ``cov`` (h, w, 3) is too small for the weighted majority of ``residual`` (h, w, 2).
 
     The median of the squared Mahalanobis length over that of two unit normals, 2 ln 2. Where pose or depths are worse

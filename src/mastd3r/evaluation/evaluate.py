@@ -16,15 +16,7 @@ from ..errors import InputError
 from ..types import Frame, State, Trajectory, Truth
 from .image_error import psnr, ssim
 from .mask_error import MaskError, mask_error, read_mask
-from .trajectory_error import (
-    AteResult,
-    associate,
-    ate_of_positions,
-    ate_rmse,
-    drift_distance,
-    rpe,
-    rpe_over_distance,
-)
+from .trajectory_error import AteResult, associate, ate_of_positions, ate_rmse, drift_distance, rpe, rpe_over_distance
 
 Array = NDArray[Any]
 PSNR_CEILING_DB = float(10 * np.log10(255**2 / 1e-9))  # stands for equal images, so that a mean exists

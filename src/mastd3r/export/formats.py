@@ -9,8 +9,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.pinhole import Camera
 from ..errors import ConfigError, InputError
-from ..geometry.camera import Camera
 from ..geometry.se3 import inverse
 from ..types import Trajectory
 from .files import write_bytes, write_text, writing

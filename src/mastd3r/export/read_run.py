@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.pinhole import Camera
 from ..errors import InputError
-from ..geometry.camera import Camera
 from ..types import State, Trajectory
 from .run_folder import stamp
 from .trajectory_files import read_tum

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.pinhole import Camera
 from ..errors import OutputError
-from ..geometry.camera import Camera
 from ..types import StaticCloud, Trajectory
 from .claim import RESERVE, claim
 from .files import write_bytes, write_json, write_text

@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 from ..geometry.se3 import transform
 
 Array = NDArray[Any]
 
 
-def trust(inv_depth: Array, info: Array) -> Array:
+def depth_confidence(inv_depth: Array, info: Array) -> Array:
     """0..1, how well an inverse depth is known: 1/(1 + (relative 1-sigma / 0.1)²)."""
     return 1 / (1 + 100.0 / np.maximum(info * inv_depth**2, 1e-12))
 
 
-def filled(inv_depth: Array, info: Array, grid: tuple[int, int]) -> Array:
+def inpainted(inv_depth: Array, info: Array, grid: tuple[int, int]) -> Array:
     """(p,) inverse depths with the unknown ones replaced by their known neighbours (normalised convolution)."""
-    t = trust(inv_depth, info).reshape(grid).astype(np.float32)
+    t = depth_confidence(inv_depth, info).reshape(grid).astype(np.float32)
     d = inv_depth.reshape(grid).astype(np.float32)
     smooth = np.full(grid, np.float32(np.average(d, weights=t + 1e-6)))
     for sigma in (8.0, 4.0, 2.0, 1.0):
@@ -50,7 +50,7 @@ def carried(
     A point behind the camera, or seen edge-on from far away in the image, has no say (trust 0).
     """
     points = transform(new_from_ref, camera.rays(px) / np.maximum(inv_depth, 1e-9)[:, None])
-    t = trust(inv_depth, info)
+    t = depth_confidence(inv_depth, info)
     ok = (points[:, 2] > 1e-3 / np.maximum(inv_depth.max(), 1e-9)) & (t > 0.05)
     if ok.sum() < 8:
         return np.full(len(at_px), float(np.median(inv_depth))), np.zeros(len(at_px))

@@ -10,19 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import CameraConfig, GraphConfig
-from ..geometry.camera import Camera
-from ..geometry.reprojection import N_GLOBAL
+from ..camera.pinhole import Camera
+from ..config import GraphConfig
+from ..geometry.reprojection_kernels import N_GLOBAL
 from ..geometry.se3 import inverse
 from ..types import Matches, State, WorkFrame
-from .bundle import Block, Edge, Lens, SolveReport, solve
+from .bundle_adjustment import SolveReport, solve
+from .factors import KeyframeVariables, ReprojectionFactor
+from .intrinsics import LATE, RADIAL, Intrinsics, camera_of
 
 Array = NDArray[Any]
-PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
-PRIOR_RADIAL_SIGMA = (0.05, 0.1, 0.1)  # of k, m, n
-PRIOR_CENTRE_SIGMA = 0.02  # of the principal point from the image's centre / width
-RADIAL, LATE = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what waits for lens_keyframes
-PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
@@ -54,12 +51,12 @@ class FrameRecord:
 class KeyframeGraph:
     """Keyframes and what holds them together. Lengths are map units, pixels are at working size."""
 
-    def __init__(self, config: GraphConfig, lens: Lens) -> None:
-        self.config, self.lens = config, lens
+    def __init__(self, config: GraphConfig, lens: Intrinsics) -> None:
+        self.config, self.intrinsics = config, lens
         self.size = (0, 0)
         self.keyframes: list[Keyframe] = []
-        self.blocks: dict[int, Block] = {}
-        self.edges: list[Edge] = []
+        self.variables: dict[int, KeyframeVariables] = {}
+        self.edges: list[ReprojectionFactor] = []
         self.records: list[FrameRecord] = []
         self.submap = 0  # the one being tracked
         self.submap_of: dict[int, int] = {}
@@ -89,20 +86,20 @@ class KeyframeGraph:
 
     def camera(self) -> Camera:
         """The lens at working size."""
-        return camera_of(self.lens, self.size)
+        return camera_of(self.intrinsics, self.size)
 
     def world_from_cam(self, kf_id: int) -> Array:
         """(4, 4) pose of a keyframe."""
-        return inverse(self.blocks[kf_id].cam_from_world)
+        return inverse(self.variables[kf_id].cam_from_world)
 
     def depth_info(self, kf_id: int) -> Array:
         """(p,) information of a keyframe's inverse depths, prior included."""
-        block = self.blocks[kf_id]
+        block = self.variables[kf_id]
         return block.prior_info if len(block.depth_info) == 0 else block.depth_info + block.prior_info
 
     def median_inv_depth(self, kf_id: int) -> float:
         """Median over the points that have been seen from elsewhere."""
-        block = self.blocks[kf_id]
+        block = self.variables[kf_id]
         seen = block.depth_info > 0 if len(block.depth_info) else np.zeros(len(block.inv_depth), bool)
         return float(np.median(block.inv_depth[seen] if seen.sum() > 10 else block.inv_depth))
 
@@ -122,10 +119,12 @@ class KeyframeGraph:
         self.size = (work.gray.shape[1], work.gray.shape[0])
         self.keyframes.append(kf)
         self.submap_of[kf.id] = self.submap
-        self.blocks[kf.id] = Block(work.px, inv_depth, inv_depth.copy(), prior_info, cam_from_world)
+        self.variables[kf.id] = KeyframeVariables(work.px, inv_depth, inv_depth.copy(), prior_info, cam_from_world)
         return kf
 
-    def edge(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> Edge | None:
+    def edge(
+        self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False
+    ) -> ReprojectionFactor | None:
         """Matches of i's pixels in j as an edge, not yet added; None where too few survive the static weight.
 
         ``followed``: the camera was tracked from i to j. Then few are enough, or the chain would come apart there.
@@ -134,7 +133,7 @@ class KeyframeGraph:
         least = 0.0 if followed else self.config.min_match_ratio
         if (weight > 0.05).mean() < least or (weight > 0.05).sum() < 20:
             return None
-        return Edge(i, j, matches.new_px, weight)
+        return ReprojectionFactor(i, j, matches.new_px, weight)
 
     def connect(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> bool:
         """Add an ``edge``; False where there is none."""
@@ -179,7 +178,7 @@ class KeyframeGraph:
         )
 
     def doubt(self, kf_id: int, static: Array) -> None:
-        """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
+        """Future evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
 
         The frames that hang on the keyframe keep matches of these points, which count for less as well.
         """
@@ -205,7 +204,7 @@ class KeyframeGraph:
         assert all(n == kf.id for n, kf in enumerate(self.keyframes))
         self.edges = [e for e in self.edges if e.i not in gone and e.j not in gone]
         for k in gone:
-            del self.blocks[k], self.submap_of[k]
+            del self.variables[k], self.submap_of[k]
         for r in self.records:
             if r.kf_id in gone:
                 r.state, r.is_keyframe, r.kf_id = "lost", False, max(len(self.keyframes) - 1, 0)
@@ -215,10 +214,10 @@ class KeyframeGraph:
     def part(self) -> KeyframeGraph:
         """The submap being tracked as a graph by itself, sharing keyframes, blocks, edges and records."""
         ids = set(self.members())
-        out = KeyframeGraph(self.config, self.lens)
+        out = KeyframeGraph(self.config, self.intrinsics)
         out.size, out.submap = self.size, self.submap
         out.keyframes = [kf for kf in self.keyframes if kf.id in ids]
-        out.blocks = {k: self.blocks[k] for k in sorted(ids)}
+        out.variables = {k: self.variables[k] for k in sorted(ids)}
         out.submap_of = dict.fromkeys(sorted(ids), self.submap)
         out.edges = self.edges_among(ids)
         out.records = [r for r in self.records if r.kf_id in ids]
@@ -228,15 +227,15 @@ class KeyframeGraph:
         """A copy to which edges may be added, and whose window may be solved, while this one is read."""
         out = copy.copy(self)
         out.keyframes, out.edges, out.records = list(self.keyframes), list(self.edges), []
-        out.blocks = {k: copy.copy(b) for k, b in self.blocks.items()}
-        out.lens = copy.copy(self.lens)
+        out.variables = {k: copy.copy(b) for k, b in self.variables.items()}
+        out.intrinsics = copy.copy(self.intrinsics)
         return out
 
     def take(self, aside: KeyframeGraph) -> None:
         """Edges, poses, depths and lens of a copy; nothing may have been added here since."""
         if len(aside.keyframes) != len(self.keyframes):
             raise ValueError(f"take: expected a copy of {len(self.keyframes)} keyframes, got {len(aside.keyframes)}")
-        self.edges, self.blocks, self.lens = aside.edges, aside.blocks, aside.lens
+        self.edges, self.variables, self.intrinsics = aside.edges, aside.variables, aside.intrinsics
 
     # -- optimisation ----------------------------------------------------------------------------------------
 
@@ -252,13 +251,13 @@ class KeyframeGraph:
         early = RADIAL if len(self.keyframes) < self.config.radial_keyframes else ()
         lens = self._lens_with(early if moves else range(N_GLOBAL))
         report = solve(
-            {k: self.blocks[k] for k in sorted(near)},
+            {k: self.variables[k] for k in sorted(near)},
             edges,
             lens,
             fixed=fixed,
             iterations=self.config.window_iterations * (2 if whole else 1),
         )
-        self.lens.g = lens.g
+        self.intrinsics.values = lens.values
         if whole and self.submap == 0:
             self.normalise()
         return report
@@ -266,7 +265,7 @@ class KeyframeGraph:
     def solve_depths(self, kf_id: int, iterations: int = 3) -> None:
         """The depths of one keyframe from the edges that it has; poses and lens stay."""
         edges = [e for e in self.edges if e.i == kf_id]
-        near = {k: self.blocks[k] for k in sorted({kf_id, *(e.j for e in edges)})}
+        near = {k: self.variables[k] for k in sorted({kf_id, *(e.j for e in edges)})}
         solve(near, edges, self._lens_with(range(N_GLOBAL)), fixed=frozenset(near), iterations=iterations)
 
     @property
@@ -278,7 +277,7 @@ class KeyframeGraph:
         """Every keyframe moves but the first of each submap."""
         lens = self._lens_with(())
         report = solve(
-            self.blocks,
+            self.variables,
             self.edges,
             lens,
             fixed=frozenset(self.roots()),
@@ -286,37 +285,37 @@ class KeyframeGraph:
             kernel_px=kernel_px,
             tolerance=1e-5,
         )
-        self.lens.g = lens.g
+        self.intrinsics.values = lens.values
         self.normalise()
         self.last_report = report
         return report
 
-    def _lens_with(self, fixed: Iterable[int]) -> Lens:
+    def _lens_with(self, fixed: Iterable[int]) -> Intrinsics:
         """The lens with some unknowns fixed: those named, and those that too few views cannot tell apart."""
         hold = set(fixed)
         if len(self.keyframes) < self.config.lens_keyframes:
             hold |= set(LATE)
-        info = np.where(np.isin(np.arange(N_GLOBAL), list(hold)), np.inf, self.lens.prior_info)
-        return Lens(self.lens.g, self.lens.prior, info)
+        info = np.where(np.isin(np.arange(N_GLOBAL), list(hold)), np.inf, self.intrinsics.prior_info)
+        return Intrinsics(self.intrinsics.values, self.intrinsics.prior, info)
 
     def normalise(self) -> None:
         """Monocular scale is free: keep the median inverse depth of the first three keyframes at one.
 
         Where depths are measured (strong priors) the scale is theirs and nothing is done.
         """
-        first = [self.blocks[k] for k in sorted(self.blocks)[:3]]
+        first = [self.variables[k] for k in sorted(self.variables)[:3]]
         if any((b.prior_info * b.inv_depth**2 > 25).mean() > 0.1 for b in first):
             return
-        m = float(np.median([self.median_inv_depth(k) for k in sorted(self.blocks)[:3]]))
+        m = float(np.median([self.median_inv_depth(k) for k in sorted(self.variables)[:3]]))
         if not np.isfinite(m) or m <= 0:
             return
-        self.stretch(self.blocks, m)
+        self.rescale(self.variables, m)
 
-    def stretch(self, ids: Iterable[int], factor: float) -> None:
+    def rescale(self, ids: Iterable[int], factor: float) -> None:
         """Lengths of some keyframes, and of the frames that hang on them, times ``factor``: about the origin."""
         chosen = set(ids)
         for k in chosen:
-            b = self.blocks[k]
+            b = self.variables[k]
             b.cam_from_world = b.cam_from_world.copy()
             b.cam_from_world[:3, 3] *= factor
             b.inv_depth, b.prior_depth = b.inv_depth / factor, b.prior_depth / factor
@@ -334,7 +333,7 @@ class KeyframeGraph:
         """All pairs that are ``connected``, for those who ask about many."""
         return {frozenset((e.i, e.j)) for e in self.edges}
 
-    def edges_among(self, ids: Iterable[int]) -> list[Edge]:
+    def edges_among(self, ids: Iterable[int]) -> list[ReprojectionFactor]:
         """Edges with both ends in ``ids``."""
         inside = set(ids)
         return [e for e in self.edges if e.i in inside and e.j in inside]
@@ -342,48 +341,3 @@ class KeyframeGraph:
 
 def _nothing() -> tuple[Array, Array, Array]:
     return np.zeros(0, int), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-
-
-def camera_of(lens: Lens, size: tuple[int, int]) -> Camera:
-    """The camera (width, height) that a lens stands for; radial terms fitted to the undistortion of the solver."""
-    f, cx, cy = float(np.exp(lens.g[0])), float(lens.g[2]), float(lens.g[3])
-    return Camera(f, f, cx, cy, *size, *inverse_radial(f, tuple(lens.g[list(RADIAL)]), size))
-
-
-def inverse_radial(focal_px: float, terms: tuple[float, ...], size: tuple[int, int]) -> tuple[float, ...]:
-    """(a, b, c) of x = y (1 + a y² + b y⁴ + c y⁶) from those of y = x (1 + …) in ``terms``.
-
-    Least squares over radii of the image, weighted to be best in y's pixels; as many terms as are not zero there,
-    so that a lens of one term stays one. Both ways: the solver undistorts, ``Camera`` distorts.
-    """
-    used = max((n + 1 for n, t in enumerate(terms) if t != 0.0), default=0)
-    if used == 0:
-        return 0.0, 0.0, 0.0
-    x = np.linspace(0.05, 1.0, 60) * 0.5 * np.hypot(*size) / focal_px
-    y = x * (1 + sum(t * x ** (2 * n + 2) for n, t in enumerate(terms)))
-    powers = np.stack([y ** (2 * n + 3) for n in range(used)], -1)
-    found = np.linalg.lstsq(powers, x - y, rcond=None)[0]
-    return tuple(float(v) for v in (*found, 0.0, 0.0))[:3]
-
-
-def lens_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int, int]) -> Lens:
-    """The lens before anything is seen: given intrinsics fixed, otherwise centred with wide priors.
-
-    The optimisation knows one focal length, so fx and fy are joined by their geometric mean.
-    """
-    if camera.intrinsics:
-        fx, fy, cx, cy = camera.intrinsics[:4]
-        c = Camera(fx, fy, cx, cy, *full_size).resized(width, height)
-        f = float(np.sqrt(c.fx_px * c.fy_px))
-        k1 = camera.intrinsics[4] if len(camera.intrinsics) > 4 else 0.0
-        k, m, n = inverse_radial(f, (k1, 0.0, 0.0), (width, height))
-        g = np.array([np.log(f), k, c.cx_px, c.cy_px, m, n])
-        return Lens(g, g.copy(), np.full(N_GLOBAL, np.inf))
-    focal = PRIOR_FOCAL_RATIO * np.sqrt(width * height)
-    g = np.array([np.log(focal), 0.0, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0])
-    centre = PRIOR_CENTRE_SIGMA * width
-    sigma = np.array([PRIOR_FOCAL_SIGMA, PRIOR_RADIAL_SIGMA[0], centre, centre, *PRIOR_RADIAL_SIGMA[1:]])
-    info = PRIOR_GAIN / sigma**2
-    if not camera.estimate_radial:
-        info[1:] = np.inf
-    return Lens(g, g.copy(), info)

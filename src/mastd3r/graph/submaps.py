@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.se3 import inverse, se3_exp, se3_log
 from ..types import Matches
-from .depth import trust
+from .depth import depth_confidence
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
@@ -26,15 +26,15 @@ def scale_between(
 
     ``j_from_i`` (4, 4) in i's lengths; ``matches`` of i's pixels in j, ``weight`` (p,).
     """
-    a, b, grid = graph.blocks[i], graph.blocks[j], graph.keyframes[j].work.grid
-    known_a = trust(a.inv_depth, graph.depth_info(i)) > 0.5
+    a, b, grid = graph.variables[i], graph.variables[j], graph.keyframes[j].work.grid
+    known_a = depth_confidence(a.inv_depth, graph.depth_info(i)) > 0.5
     rays = graph.camera().rays(a.px)
     depth = (rays / np.maximum(a.inv_depth, 1e-9)[:, None]) @ j_from_i[2, :3] + j_from_i[2, 3]
     cell_px = min(graph.size[0] // grid[1], graph.size[1] // grid[0])
     at = matches.new_px / cell_px - 0.5 + 0.5 / cell_px
     xy = at.astype(np.float32)[:, None]
     inv_b = cv2.remap(b.inv_depth.reshape(grid).astype(np.float32), xy, None, cv2.INTER_NEAREST)[:, 0]
-    trusted = trust(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
+    trusted = depth_confidence(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
     known_b = cv2.remap(trusted, xy, None, cv2.INTER_NEAREST)[:, 0] > 0.5
     used = known_a & known_b & (weight > 0.05) & (depth > 0) & (inv_b > 0)
     return float(np.median(depth[used] * inv_b[used])) if used.sum() >= MIN_COMMON else None
@@ -46,15 +46,15 @@ def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, scale: float) ->
     ``j_from_i`` (4, 4) in i's lengths; ``scale``: i's lengths per length of j's submap.
     """
     keep, gone = graph.submap_of[i], graph.submap_of[j]
-    cam_from_a = j_from_i @ graph.blocks[i].cam_from_world
-    cam_from_b = graph.blocks[j].cam_from_world
+    cam_from_a = j_from_i @ graph.variables[i].cam_from_world
+    cam_from_b = graph.variables[j].cam_from_world
     stretched = cam_from_b.copy()
     stretched[:3, 3] *= scale
     b_from_a = inverse(stretched) @ cam_from_a  # both in a's lengths
     moved = graph.members(gone)
-    graph.stretch(moved, scale)
+    graph.rescale(moved, scale)
     for k in moved:
-        block = graph.blocks[k]
+        block = graph.variables[k]
         block.cam_from_world = block.cam_from_world @ b_from_a
         graph.submap_of[k] = keep
     graph.started.discard(gone)
@@ -79,11 +79,11 @@ def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
         if not before:
             continue
         first, last, past = graph.records[own[0]], before[-1], before[-min(len(before), VELOCITY_FRAMES)]
-        now, then = (r.cam_from_kf @ graph.blocks[r.kf_id].cam_from_world for r in (last, past))
+        now, then = (r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world for r in (last, past))
         span_s = max(last.timestamp_s - past.timestamp_s, 1e-9)
         ahead = min((first.timestamp_s - last.timestamp_s) / span_s, MOST_AHEAD)
         guess = se3_exp(ahead * se3_log(now @ inverse(then))) @ now
         i, j = last.kf_id, first.kf_id
         scale = graph.median_inv_depth(j) / graph.median_inv_depth(i)
-        join(graph, i, j, guess @ inverse(graph.blocks[i].cam_from_world), float(scale))
+        join(graph, i, j, guess @ inverse(graph.variables[i].cam_from_world), float(scale))
     return out

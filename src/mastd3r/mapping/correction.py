@@ -24,7 +24,7 @@ FIT_PRIOR = 0.3  # holds a pose correction near none: mean square error in the i
 
 
 @dataclass(frozen=True)
-class Sight:
+class Visibility:
     """How much of one view's picture each Gaussian makes up, and what the correction does to what it shows."""
 
     change: Array  # (4, 4) new_world_from_old_world, a similarity
@@ -41,20 +41,20 @@ def changes_of(old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int,
     }
 
 
-def bend(changes: Iterable[Array], point: Array) -> float:
+def deformation(changes: Iterable[Array], point: Array) -> float:
     """How far apart the changes would put one point: the largest distance from the mean. 0 for a rigid correction."""
     moved = np.stack([c[:3, :3] @ point + c[:3, 3] for c in changes])
     return float(np.linalg.norm(moved - moved.mean(0), axis=1).max())
 
 
-def sight(
+def visibility(
     gaussians: GaussianMap,
     change: Array,
     cam_from_world: torch.Tensor,
     intrinsics: torch.Tensor,
     pixel_weight: torch.Tensor,
     near: float,
-) -> Sight:
+) -> Visibility:
     """What one view (h, w) sees of the map; ``pixel_weight`` is what the pixels count in training.
 
     A picture is linear in the colours: its gradient in a colour is the weight of that Gaussian.
@@ -64,10 +64,10 @@ def sight(
     height, width = pixel_weight.shape
     color, _, _ = plain.draw(cam_from_world.detach(), intrinsics, width, height, near)
     (weight_px,) = torch.autograd.grad((color[..., 0] * pixel_weight).sum(), colors)
-    return Sight(change, cam_from_world.detach().cpu().numpy(), weight_px[:, 0].detach())
+    return Visibility(change, cam_from_world.detach().cpu().numpy(), weight_px[:, 0].detach())
 
 
-def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable[Sight]) -> GaussianMap:
+def followed(gaussians: GaussianMap, changes: dict[int, Array], visibilities: Iterable[Visibility]) -> GaussianMap:
     """The map after a correction, each Gaussian moved by the mean of what its sights say.
 
     Its centre: least squares over the views, where a view counts by its pixels, and along its ray only by
@@ -84,7 +84,7 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], sights: Iterable
     shift = ANCHOR_PX * (anchored.means.detach().double() - before)
     turn, log_scale = ANCHOR_PX * anchor_turn, ANCHOR_PX * anchor_scale
     pixels = torch.full((len(before),), ANCHOR_PX, dtype=torch.float64, device=device)
-    for seen in sights:
+    for seen in visibilities:
         change, weight, centre_ = seen.change, seen.weight_px.double(), inverse(seen.cam_from_world)[:3, 3]
         linear, offset, centre = (
             torch.from_numpy(np.array(a, float)).to(device) for a in (change[:3, :3], change[:3, 3], centre_)

@@ -9,20 +9,20 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
+from ..camera.pinhole import Camera
+from ..concurrency import one_torch_thread
 from ..config import MappingConfig
 from ..errors import ConfigError, InputError
-from ..geometry.camera import Camera
 from ..geometry.se3 import inverse, transform
 from ..types import StaticCloud, View
 from .adam import RowAdam
-from .correction import Sight, bend, changes_of, fitted_pose, followed, sight
+from .correction import Visibility, changes_of, deformation, fitted_pose, followed, visibility
 from .densify import DensifyPolicy, DensifySettings
 from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
 from .screen import ScreenStats
 from .seed import seed_gaussians
 from .splat import as_pictures
-from .threads import one_torch_thread
 from .view_parameters import ViewParameters
 
 T = TypeVar("T")
@@ -153,37 +153,37 @@ class Mapper:
         hung = [changes.get(v.kf_id, np.eye(4)) for v in self._views]
         middle = self._map.means.detach().double().median(0).values.cpu().numpy()
         before, views = self._map, self._view_parameters
-        if bend(hung, middle) <= BEND_RATIO * self._depth:
+        if deformation(hung, middle) <= BEND_RATIO * self._depth:
             self._map = before.moved(old_world_from_kf, new_world_from_kf)
             views.move_keyframes(old_world_from_kf, new_world_from_kf)
             return
-        sights = dict(self._sights(hung))
+        visibilities = dict(self._sights(hung))
         trained_with = [views.cam_from_world(n).detach().numpy() for n in range(len(self._views))]
-        self._map = followed(before, changes, sights.values())
+        self._map = followed(before, changes, visibilities.values())
         views.move_keyframes(old_world_from_kf, new_world_from_kf)
         if self.config.refine_poses:
-            self._fit_poses(before, trained_with, sights)
+            self._fit_poses(before, trained_with, visibilities)
 
-    def _sights(self, changes: list[Array]) -> Iterator[tuple[int, Sight]]:
+    def _sights(self, changes: list[Array]) -> Iterator[tuple[int, Visibility]]:
         """What a part of the views sees of the map now; ``changes`` are those of all views' keyframes."""
         for number in _evenly(range(len(self._views)), MAX_SIGHTS):
             view, (_, weight) = self._views[number], self._target(number)
             K = torch.from_numpy(view.camera.matrix).to(self._device)
             pose = self._view_parameters.cam_from_world(number).detach()
             refined = inverse(self._view_parameters.tracked_cam_from_world(number)) @ pose.numpy()
-            yield number, sight(self._map, changes[number] @ refined, pose, K, weight, self._near)
+            yield number, visibility(self._map, changes[number] @ refined, pose, K, weight, self._near)
 
-    def _fit_poses(self, before: GaussianMap, trained_with: list[Array], sights: dict[int, Sight]) -> None:
+    def _fit_poses(self, before: GaussianMap, trained_with: list[Array], visibilities: dict[int, Visibility]) -> None:
         """Every view's pose correction anew: the map as it is now is shown as ``before`` was.
 
         A view that was not drawn sees what the nearest one in time that was drawn sees.
         """
         old, new = (m.means.detach().double().cpu().numpy() for m in (before, self._map))
-        drawn = np.array(sorted(sights, key=lambda n: self._views[n].timestamp_s))
+        drawn = np.array(sorted(visibilities, key=lambda n: self._views[n].timestamp_s))
         times_s = np.array([self._views[n].timestamp_s for n in drawn])
         for number, pose in enumerate(trained_with):
             nearest = drawn[np.abs(times_s - self._views[number].timestamp_s).argmin()]
-            weight = sights[int(nearest)].weight_px.double().cpu().numpy()
+            weight = visibilities[int(nearest)].weight_px.double().cpu().numpy()
             tracked = self._view_parameters.tracked_cam_from_world(number)
             found = fitted_pose(transform(pose, old), transform(tracked, new), weight, self._depth)
             self._view_parameters.correct(number, *found)

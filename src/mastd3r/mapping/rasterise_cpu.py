@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..concurrency import in_blocks
 from .rasterise_cpu_blend import CHANNELS, TILE
 from .rasterise_cpu_project import GRADS, project_backward, project_forward, view_parameters
 from .rasterise_cpu_tiles import bin_tiles, depth_order, tiles_backward, tiles_forward
 from .screen import ScreenStats
-from .threads import in_blocks
 
 _CHUNKS = 64  # fixed, so that sums do not depend on the number of threads
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 from .gaussians import Array, GaussianArrays, GaussianMap
 
 OPAQUE = 0.5  # alpha above which a pixel has a depth

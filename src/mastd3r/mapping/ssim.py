@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numba import njit
 
+from ..concurrency import in_blocks
 from .rasterise_cpu_project import JIT
-from .threads import in_blocks
 
 _SIGMA, _SIZE = 1.5, 11
 _C1, _C2 = 0.01**2, 0.03**2

@@ -17,10 +17,10 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
+from ..download.weights import path as weights_path
 from ..errors import InputError, MissingPackage
 from .products import products
 from .record import Recorder
-from .weights import path as weights_path
 
 Array = NDArray[Any]
 

@@ -117,10 +117,10 @@ def matched(
     x, y = at.unbind(1)
     wanted = source_points[y, x]
     near, cost = search_rays(ray_image(points), wanted, start, options)
-    found, likeness = search_descriptors(descriptors, source_descriptors[y, x], near, options)
+    found, similarity = search_descriptors(descriptors, source_descriptors[y, x], near, options)
     tx, ty = found.round().long().unbind(1)
     nx, ny = near.round().long().unbind(1)
-    valid = (cost < options.converged) & (likeness > -1)
+    valid = (cost < options.converged) & (similarity > -1)
     for there in (points[ny, nx], points[ty, tx]):
         valid &= same_place(there, wanted, options.distance_ratio)
     ends = torch.stack([sure[ty, tx], source_sure[y, x]])
@@ -129,7 +129,7 @@ def matched(
     if options.reciprocal_px > 0:
         back, _ = search_descriptors(source_descriptors, descriptors[ty, tx], at.float(), options)
         valid &= (back - at).norm(dim=1) <= options.reciprocal_px
-    rest = torch.stack([valid.double(), confidence.double(), likeness.double()], 1)
+    rest = torch.stack([valid.double(), confidence.double(), similarity.double()], 1)
     return torch.cat([found.double(), rest], 1)
 
 
@@ -249,7 +249,7 @@ def search_descriptors(
         return start_px, start_px.new_zeros(0)
     blocks = zip(wanted.split(_ROWS_AT_ONCE), start_px.split(_ROWS_AT_ONCE), strict=True)
     found = [_search_block(descriptors, rows, start, options) for rows, start in blocks]
-    return torch.cat([px for px, _ in found]), torch.cat([likeness for _, likeness in found])
+    return torch.cat([px for px, _ in found]), torch.cat([similarity for _, similarity in found])
 
 
 def _search_block(maps: Tensor, wanted: Tensor, start_px: Tensor, options: Options) -> tuple[Tensor, Tensor]:
@@ -258,15 +258,15 @@ def _search_block(maps: Tensor, wanted: Tensor, start_px: Tensor, options: Optio
     one_way = torch.arange(-options.radius, options.radius + 1, device=maps.device)
     offsets = torch.cartesian_prod(one_way, one_way).flip(1)  # row by row
     middle = len(offsets) // 2
-    likeness = wanted.new_full((len(wanted),), -1.0)
+    similarity = wanted.new_full((len(wanted),), -1.0)
     for step in range(options.dilation_max, 0, -1):
         candidates = at[:, None] + step * offsets
         values = _likeness(maps, candidates, wanted).nan_to_num(-1.0)
-        likeness, chosen = values.max(1)
-        chosen = torch.where(values[:, middle] >= likeness, middle, chosen)
+        similarity, chosen = values.max(1)
+        chosen = torch.where(values[:, middle] >= similarity, middle, chosen)
         moved = candidates.gather(1, chosen[:, None, None].expand(-1, 1, 2))[:, 0]
-        at = torch.where((likeness > -1)[:, None], moved, at)
-    return at + _top(maps, at, wanted, likeness), likeness
+        at = torch.where((similarity > -1)[:, None], moved, at)
+    return at + _top(maps, at, wanted, similarity), similarity
 
 
 def _top(maps: Tensor, at: Tensor, wanted: Tensor, best: Tensor) -> Tensor:

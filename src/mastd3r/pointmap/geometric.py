@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
 from .base import Observing
 from .flow import FlowMatcher, corner_grid

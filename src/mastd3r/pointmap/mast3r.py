@@ -26,8 +26,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..camera.pinhole import Camera
 from ..errors import InputError
-from ..geometry.camera import Camera
 from ..geometry.sim3 import Sim3, procrustes
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
 from .base import Observing

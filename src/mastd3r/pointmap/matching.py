@@ -64,7 +64,7 @@ class FoundPixels:
     px: Array  # (n, 2) float64, sub-pixel, of the target's network image
     valid: Array  # (n,) bool: in view, one place in space, sure enough, mutual where that was asked
     confidence: Array  # (n,) float64, geometric mean of both descriptor confidences; 0 where not finite
-    likeness: Array  # (n,) float64, scalar product of the descriptors; -1 where none could be compared
+    similarity: Array  # (n,) float64, scalar product of the descriptors; -1 where none could be compared
 
 
 def match_pixels(
@@ -82,9 +82,9 @@ def match_pixels(
     points = source.points[y, x].astype(np.float64)
     near, cost = search_rays(ray_image(target.points), points, start, options)
     wanted = np.ascontiguousarray(source.descriptors[y, x], np.float32)
-    found, likeness = search_descriptors(target.descriptors, wanted, near, options)
+    found, similarity = search_descriptors(target.descriptors, wanted, near, options)
     tx, ty = _whole(found, target.points.shape)
-    valid = (cost < options.converged) & (likeness > -1)
+    valid = (cost < options.converged) & (similarity > -1)
     for x_there, y_there in (_whole(near, target.points.shape), (tx, ty)):  # hidden; then: led astray
         valid &= same_place(target.points[y_there, x_there], points, options.distance_ratio)
     ends = np.stack([target.descriptor_confidence[ty, tx], source.descriptor_confidence[y, x]]).astype(float)
@@ -94,7 +94,7 @@ def match_pixels(
         alike = np.ascontiguousarray(target.descriptors[ty, tx], np.float32)
         back, _ = search_descriptors(source.descriptors, alike, np.stack([x, y], 1).astype(float), options)
         valid &= np.hypot(back[:, 0] - x, back[:, 1] - y) <= options.reciprocal_px
-    return FoundPixels(found, valid, confidence, likeness)
+    return FoundPixels(found, valid, confidence, similarity)
 
 
 def subsampled(height: int, width: int, step_px: int) -> tuple[Array, tuple[int, int]]:
@@ -278,7 +278,7 @@ def _search_descriptors(
     maps: Array, wanted: Array, start: Array, radius: int, dilation_max: int
 ) -> tuple[Array, Array]:
     h, w = maps.shape[:2]
-    out, likeness = np.empty((len(wanted), 2)), np.empty(len(wanted))
+    out, similarity = np.empty((len(wanted), 2)), np.empty(len(wanted))
     for n in range(len(wanted)):
         row = wanted[n]
         x, y, best = start[n, 0], start[n, 1], -1.0
@@ -297,8 +297,8 @@ def _search_descriptors(
                     value = _likeness(maps, py, px, row)
                     if best < value < _MOST_ALIKE:
                         best, x, y = value, px, py
-        out[n, 0], out[n, 1], likeness[n] = x, y, best
+        out[n, 0], out[n, 1], similarity[n] = x, y, best
         if best > -1.0 and 0 < x < w - 1 and 0 < y < h - 1:
             dx, dy = _top(maps, y, x, row, best)
             out[n, 0], out[n, 1] = x + dx, y + dy
-    return out, likeness
+    return out, similarity

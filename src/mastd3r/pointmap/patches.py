@@ -138,7 +138,7 @@ def align_some(
     r = q // 2
     h, w = ref.shape
     out = start.copy()
-    likeness = np.full(p, -1.0)
+    similarity = np.full(p, -1.0)
     wide = np.empty((q + 2, q + 2), np.float32)
     value, seen = np.empty((q, q), np.float32), np.empty((q, q), np.float32)
     grad = np.empty((2, q, q), np.float32)
@@ -173,8 +173,8 @@ def align_some(
                 break
         if step2 < (20 * SETTLED_PX) ** 2:
             out[n, 0], out[n, 1] = x, y
-            likeness[n] = corr
-    return out, likeness
+            similarity[n] = corr
+    return out, similarity
 
 
 def window(size_px: int, sigma_px: float) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..geometry.camera import Camera
+from ..camera.pinhole import Camera
 from . import room_textures as tex
 
 Array = NDArray[Any]

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..camera.pinhole import Camera
 from ..errors import OutputError
-from ..geometry.camera import Camera
 from ..types import Frame
 from .room import RayGrid, Room, camera_pose
 

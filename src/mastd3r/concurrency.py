@@ -1,0 +1,138 @@
+"""Every thread of the package: values in the making, items made ready ahead, work in two threads or in blocks.
+
+Results never depend on which thread was faster."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, Generic, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+T = TypeVar("T")
+C = TypeVar("C")
+
+
+class Future(Generic[T]):
+    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised."""
+
+    def __init__(self, get: Callable[[], T]) -> None:
+        self.get = get
+
+    @staticmethod
+    def done(value: T) -> Future[T]:
+        """One that is there."""
+        return Future(lambda: value)
+
+
+class Worker:
+    """One thread beside the caller's: what is given to it is done in order."""
+
+    def __init__(self, name: str) -> None:
+        self._pool = ThreadPoolExecutor(1, name)
+
+    def submit(self, make: Callable[[], T]) -> Future[T]:
+        """The value of ``make``, made there."""
+        return Future(self._pool.submit(make).result)
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Waits for all that was given to it."""
+        self._pool.shutdown()
+
+
+def prefetch(items: Iterator[T], work: Callable[[T, C], None], context: Callable[[], C]) -> Iterator[T]:
+    """The items, in order; ``work`` is done on each, in one other thread, before it is given.
+
+    ``work`` also gets what ``context`` says, in the caller's thread, when the item before is given. What is raised for
+    an item is raised when the caller asks for it.
+    """
+    end = object()
+
+    def one(given: C) -> T | object:
+        item = next(items, end)
+        if item is not end:
+            work(item, given)  # type: ignore[arg-type]
+        return item
+
+    with ThreadPoolExecutor(1, "ahead") as pool:
+        job = pool.submit(one, context())
+        while (item := job.result()) is not end:
+            job = pool.submit(one, context())
+            yield item  # type: ignore[misc]
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within it BLAS computes in the thread that calls it, whatever library brought it.
+
+    Our products are small and many: BLAS's own threads would spin between them on the cores that our threads need,
+    which costs more than half of the processor's time on two cores.
+    """
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
+
+
+S = TypeVar("S")
+_BESIDE = ThreadPoolExecutor(1, "every other")
+
+
+def on_two_threads(make: Callable[[S], T], items: Sequence[S]) -> list[T]:
+    """``make`` of every item, in order; every other one is made in a thread beside, always the same ones.
+
+    So what a thread keeps from item to item (a flow engine's memory) is the same in every run. ``make`` must not call
+    this again: there is one thread beside.
+    """
+    beside = _BESIDE.submit(lambda: [make(item) for item in items[1::2]])
+    here = [make(item) for item in items[::2]]
+    out: list[Any] = [None] * len(items)
+    out[::2], out[1::2] = here, beside.result()
+    return out
+
+
+_BLOCKS_PER_THREAD = 4  # blocks of a range differ in work; several a thread even that out
+
+
+def thread_count() -> int:
+    """Cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+@cache
+def _pool(process_id: int, threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="rasterise")
+
+
+def in_blocks(kernel: Callable[..., Any], count: int, *arguments: Any, threads: int | None = None) -> None:
+    """Call ``kernel(first, last, *arguments)`` over blocks of 0 … count-1; it must not mind the split."""
+    threads = threads or thread_count()
+    blocks = min(count, threads * _BLOCKS_PER_THREAD)
+    if threads == 1 or blocks < 2:
+        kernel(0, count, *arguments)
+        return
+    pool = _pool(os.getpid(), threads)
+    edges = [block * count // blocks for block in range(blocks + 1)]
+    futures = [pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(edges)]
+    for future in futures:
+        future.result()
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """torch on one thread inside the block: its workers would spin on the cores that the kernels need."""
+    import torch  # heavy, and needed by those alone who have it already
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -1,1 +1,0 @@
-"""The public datasets that ``mastd3r download`` brings: where they are, and getting them into place."""

@@ -1,0 +1,1 @@
+"""What is fetched: files, archives, weights of networks, public datasets."""

@@ -1,0 +1,1 @@
+"""Sparse features, for jumps that dense flow cannot follow."""

@@ -1,0 +1,348 @@
+"""Numba kernels of the joint optimisation: residuals and Jacobians of flow matches (docs/joint_optimisation.md).
+
+A host keyframe i owns inverse depths d at its grid pixels. A match of grid pixel x in keyframe j at x' gives
+
+    u(x)  = e · (1 + k |e|² + m |e|⁴ + n |e|⁶),  e = (x - c)/f   undistortion, unit plane
+    Y     = R u(x) + t d,   (R, t) = j_from_i                  u(x) homogeneous
+    r     = x' - c - f v(π(Y))                                 pixels, v the inverse of u: as the image has them
+
+unknowns a pose perturbation of j (6), intrinsics g = (log f, k, cx, cy, m, n) (6), and d (1).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+_JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", "nogil": True}
+N_GLOBAL = 6
+N_POSE = 6
+N_COLS = N_POSE + N_GLOBAL
+MIN_DEPTH = 0.02  # Y_z below this share of the host's depth: the point is (nearly) behind the camera
+
+
+@nb.njit(inline="always", **_JIT)
+def _undistort(x: float, y: float, f: float, k: float, m: float, n: float) -> tuple[float, float, float]:
+    r2 = (x * x + y * y) / (f * f)
+    s = 1.0 + r2 * (k + r2 * (m + n * r2))
+    return x / f * s, y / f * s, r2
+
+
+@nb.njit(**_JIT)
+def fold_radius(k: float, m: float, n: float) -> tuple[float, float]:
+    """(radius on the bent side, on the straight side) where the lens folds: its slope falls below 0.1 there."""
+    if k == 0.0 and m == 0.0 and n == 0.0:
+        return 1e9, 1e9
+    r = 0.0
+    for _ in range(300):
+        r2 = (r + 0.01) ** 2
+        if 1.0 + r2 * (3.0 * k + r2 * (5.0 * m + 7.0 * n * r2)) < 0.1:
+            break
+        r += 0.01
+    r2 = r * r
+    return r, r * (1.0 + r2 * (k + r2 * (m + n * r2)))
+
+
+@nb.njit(inline="always", **_JIT)
+def _distort(
+    qx: float, qy: float, k: float, m: float, n: float, fold_r: float, fold_u: float
+) -> tuple[float, float, float]:
+    """v with v (1 + k |v|² + m |v|⁴ + n |v|⁶) = q by Newton on the radius, and |v|²; -1 beyond the fold."""
+    q2 = qx * qx + qy * qy
+    if fold_r > 1e8 or q2 == 0.0:
+        return qx, qy, q2
+    ru = math.sqrt(q2)
+    if ru >= fold_u:
+        return 0.0, 0.0, -1.0
+    r = min(ru, fold_r)
+    for _ in range(8):
+        r2 = r * r
+        slope = 1.0 + r2 * (3.0 * k + r2 * (5.0 * m + 7.0 * n * r2))
+        r -= (r * (1.0 + r2 * (k + r2 * (m + n * r2))) - ru) / slope
+        r = min(max(r, 0.0), fold_r)
+    s = r / ru
+    return qx * s, qy * s, r * r
+
+
+@nb.njit(inline="always", **_JIT)
+def _pose_columns(jac: Array, f: float, fz: float, d: float, qx: float, qy: float) -> None:
+    """Columns 0 to 5 of d(f q), q = pi(Y)."""
+    # pose of j, left perturbation: dY = d rho + phi x Y
+    jac[0, 0] = fz * d
+    jac[0, 1] = 0.0
+    jac[0, 2] = -fz * qx * d
+    jac[0, 3] = -f * qx * qy
+    jac[0, 4] = f * (1.0 + qx * qx)
+    jac[0, 5] = -f * qy
+    jac[1, 0] = 0.0
+    jac[1, 1] = fz * d
+    jac[1, 2] = -fz * qy * d
+    jac[1, 3] = -f * (1.0 + qy * qy)
+    jac[1, 4] = f * qx * qy
+    jac[1, 5] = f * qx
+
+
+@nb.njit(inline="always", **_JIT)
+def _lens_columns(
+    jac: Array,
+    f: float,
+    fz: float,
+    k: float,
+    m: float,
+    n: float,
+    x: float,
+    y: float,
+    r2: float,
+    vx: float,
+    vy: float,
+    s2: float,
+    qx: float,
+    qy: float,
+    t: Array,
+) -> None:
+    """Columns 6 to 11 of d(f q) through the host's ray u(x); s2 v, s2² v, s2³ v: k, m, n at the other end."""
+    p00 = fz * (t[0, 0] - qx * t[2, 0])
+    p01 = fz * (t[0, 1] - qx * t[2, 1])
+    p10 = fz * (t[1, 0] - qy * t[2, 0])
+    p11 = fz * (t[1, 1] - qy * t[2, 1])
+    ex = x / f
+    ey = y / f
+    c1 = -(1.0 + r2 * (3.0 * k + r2 * (5.0 * m + 7.0 * n * r2)))
+    along_x = p00 * ex + p01 * ey
+    along_y = p10 * ex + p11 * ey
+    jac[0, 6] = c1 * along_x
+    jac[1, 6] = c1 * along_y
+    jac[0, 7] = r2 * along_x - f * s2 * vx
+    jac[1, 7] = r2 * along_y - f * s2 * vy
+    jac[0, 10] = r2 * r2 * along_x - f * s2 * s2 * vx
+    jac[1, 10] = r2 * r2 * along_y - f * s2 * s2 * vy
+    jac[0, 11] = r2 * r2 * r2 * along_x - f * s2 * s2 * s2 * vx
+    jac[1, 11] = r2 * r2 * r2 * along_y - f * s2 * s2 * s2 * vy
+    si = (1.0 + r2 * (k + r2 * (m + n * r2))) / f
+    bend = 2.0 * (k + r2 * (2.0 * m + 3.0 * n * r2)) / f
+    m00 = si + bend * ex * ex
+    m01 = bend * ex * ey
+    m11 = si + bend * ey * ey
+    jac[0, 8] = -(p00 * m00 + p01 * m01)
+    jac[1, 8] = -(p10 * m00 + p11 * m01)
+    jac[0, 9] = -(p00 * m01 + p01 * m11)
+    jac[1, 9] = -(p10 * m01 + p11 * m11)
+
+
+@nb.njit(inline="always", **_JIT)
+def _edge_point(
+    px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, fold: tuple[float, float], jac: Array
+) -> tuple[float, float, float, float, float]:
+    """Residual (rx, ry), depth Jacobian (jd0, jd1) and Y_z; fills ``jac`` (2, 12) for [pose j, globals]."""
+    f = math.exp(g[0])
+    k = g[1]
+    m = g[4]
+    n = g[5]
+    x = px - g[2]
+    y = py - g[3]
+    ux, uy, r2 = _undistort(x, y, f, k, m, n)
+    yx = t[0, 0] * ux + t[0, 1] * uy + t[0, 2] + t[0, 3] * d
+    yy = t[1, 0] * ux + t[1, 1] * uy + t[1, 2] + t[1, 3] * d
+    yz = t[2, 0] * ux + t[2, 1] * uy + t[2, 2] + t[2, 3] * d
+    if yz < MIN_DEPTH:
+        return 0.0, 0.0, 0.0, 0.0, yz
+    iz = 1.0 / yz
+    fz = f * iz
+    qx = yx * iz
+    qy = yy * iz
+    vx, vy, s2 = _distort(qx, qy, k, m, n, fold[0], fold[1])
+    if s2 < 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    rx = tx - g[2] - f * vx
+    ry = ty - g[3] - f * vy
+    # d v/d q, the inverse of d u/d x_d = (1 + k s² + m s⁴ + n s⁶) I + 2 (k + 2 m s² + 3 n s⁴) v v^T
+    sj = 1.0 + s2 * (k + s2 * (m + n * s2))
+    bend = 2.0 * (k + s2 * (2.0 * m + 3.0 * n * s2))
+    q = bend / (sj * (sj + bend * s2))
+    w00 = 1.0 / sj - q * vx * vx
+    w01 = -q * vx * vy
+    w11 = 1.0 / sj - q * vy * vy
+    _pose_columns(jac, f, fz, d, qx, qy)
+    _lens_columns(jac, f, fz, k, m, n, x, y, r2, vx, vy, s2, qx, qy, t)
+    jd0 = fz * (t[0, 3] - qx * t[2, 3])
+    jd1 = fz * (t[1, 3] - qy * t[2, 3])
+    for i in range(N_COLS):
+        j0 = jac[0, i]
+        jac[0, i] = w00 * j0 + w01 * jac[1, i]
+        jac[1, i] = w01 * j0 + w11 * jac[1, i]
+    j0 = jd0
+    jd0 = w00 * j0 + w01 * jd1
+    jd1 = w01 * j0 + w11 * jd1
+    # the prediction c + f v itself
+    jac[0, 6] += f * vx
+    jac[1, 6] += f * vy
+    jac[0, 8] += 1.0
+    jac[1, 9] += 1.0
+    return rx, ry, jd0, jd1, yz
+
+
+@nb.njit(**_JIT)
+def anchor_system(
+    px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Normal-equation parts of all m edges of one host.
+
+    Args: px (p, 2) host pixels; depth (p,) inverse depths; target (m, p, 2) pixels in j; weight (m, p);
+        j_from_i (m, 4, 4); g (6,) intrinsics; kernel_px scale of the Cauchy kernel.
+    Returns: H (m, 12, 12), b (m, 12), E (m, p, 12) = w J^T J_d, H_dd (m, p), b_d (m, p), cost (m,).
+    """
+    m, p = weight.shape
+    fold = fold_radius(g[1], g[4], g[5])
+    hess = np.zeros((m, N_COLS, N_COLS))
+    rhs = np.zeros((m, N_COLS))
+    cross = np.zeros((m, p, N_COLS), np.float32)
+    hdd = np.zeros((m, p))
+    bd = np.zeros((m, p))
+    cost = np.zeros(m)
+    c2 = kernel_px * kernel_px
+    for e in range(m):
+        jac = np.zeros((2, N_COLS))
+        for n in range(p):
+            w = weight[e, n]
+            if w <= 0.0:
+                continue
+            rx, ry, jd0, jd1, yz = _edge_point(
+                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, fold, jac
+            )
+            if yz < MIN_DEPTH:
+                cost[e] += w * c2 * 4.0
+                continue
+            r2 = rx * rx + ry * ry
+            cost[e] += w * c2 * math.log1p(r2 / c2)
+            w = w / (1.0 + r2 / c2)
+            hdd[e, n] = w * (jd0 * jd0 + jd1 * jd1)
+            bd[e, n] = w * (jd0 * rx + jd1 * ry)
+            for i in range(N_COLS):
+                wi0 = w * jac[0, i]
+                wi1 = w * jac[1, i]
+                rhs[e, i] += wi0 * rx + wi1 * ry
+                cross[e, n, i] = wi0 * jd0 + wi1 * jd1
+                for j in range(i, N_COLS):
+                    hess[e, i, j] += wi0 * jac[0, j] + wi1 * jac[1, j]
+        for i in range(N_COLS):
+            for j in range(i):
+                hess[e, i, j] = hess[e, j, i]
+    return hess, rhs, cross, hdd, bd, cost
+
+
+@nb.njit(**_JIT)
+def anchor_columns(cross: Array, to_anchor: Array) -> Array:
+    """(p, 12 + 6 m) of one host: ``cross`` (m, p, 12) of its edges in the columns [pose i, pose j1 … jm, lens].
+
+    ``to_anchor`` (m, 6, 6): pose i's columns are those of pose j times it.
+    """
+    m, p = cross.shape[0], cross.shape[1]
+    out = np.zeros((p, 6 + 6 * m + N_GLOBAL))
+    last = 6 + 6 * m
+    for e in range(m):
+        for n in range(p):
+            for c in range(6):
+                v = cross[e, n, c]
+                if v != 0.0:
+                    out[n, 6 + 6 * e + c] = v
+                    for i in range(6):
+                        out[n, i] += v * to_anchor[e, c, i]
+            for c in range(N_GLOBAL):
+                out[n, last + c] += cross[e, n, 6 + c]
+    return out
+
+
+@nb.njit(**_JIT)
+def anchor_cost(
+    px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
+) -> Array:
+    """The robust cost (m,) of ``anchor_system`` alone, for accepting or refusing a step."""
+    m, p = weight.shape
+    fold = fold_radius(g[1], g[4], g[5])
+    cost = np.zeros(m)
+    c2 = kernel_px * kernel_px
+    for e in range(m):
+        jac = np.zeros((2, N_COLS))
+        for n in range(p):
+            if weight[e, n] <= 0.0:
+                continue
+            rx, ry, _, _, yz = _edge_point(
+                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, fold, jac
+            )
+            if yz < MIN_DEPTH:
+                cost[e] += weight[e, n] * c2 * 4.0
+            else:
+                cost[e] += weight[e, n] * c2 * math.log1p((rx * rx + ry * ry) / c2)
+    return cost
+
+
+@nb.njit(**_JIT)
+def edge_residuals(px: Array, depth: Array, target: Array, j_from_i: Array, g: Array) -> tuple[Array, Array]:
+    """Residuals (p, 2) in pixels and Y_z (p,) of one edge (1000 px where the point is behind j)."""
+    p = px.shape[0]
+    fold = fold_radius(g[1], g[4], g[5])
+    out = np.empty((p, 2))
+    z = np.empty(p)
+    for n in range(p):
+        jac = np.empty((2, N_COLS))
+        rx, ry, _, _, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, fold, jac)
+        z[n] = yz
+        out[n, 0] = rx if yz >= MIN_DEPTH else 1e3
+        out[n, 1] = ry if yz >= MIN_DEPTH else 1e3
+    return out, z
+
+
+@nb.njit(**_JIT)
+def pose_system(
+    px: Array,
+    depth: Array,
+    depth_info: Array,
+    target: Array,
+    weight: Array,
+    j_from_i: Array,
+    g: Array,
+    kernel_px: float,
+) -> tuple[Array, Array, float]:
+    """Pose-only normal equations (6, 6), (6,) and cost, each depth marginalised under its own information.
+
+    ``depth_info`` (p,) is 1/variance of the inverse depth, in units in which one pixel has variance 1:
+    the information of a residual is I - J_d J_d^T / (depth_info + |J_d|²), so unsure depths still give rotation.
+    """
+    hess = np.zeros((N_POSE, N_POSE))
+    rhs = np.zeros(N_POSE)
+    cost = 0.0
+    c2 = kernel_px * kernel_px
+    jac = np.zeros((2, N_COLS))
+    fold = fold_radius(g[1], g[4], g[5])
+    for n in range(px.shape[0]):
+        w = weight[n]
+        if w <= 0.0:
+            continue
+        rx, ry, a, b, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, fold, jac)
+        if yz < MIN_DEPTH:
+            cost += w * c2 * 4.0
+            continue
+        s = 1.0 / (depth_info[n] + a * a + b * b + 1e-12)
+        i00 = 1.0 - a * a * s
+        i01 = -a * b * s
+        i11 = 1.0 - b * b * s
+        sx = i00 * rx + i01 * ry
+        sy = i01 * rx + i11 * ry
+        r2 = rx * sx + ry * sy
+        cost += w * c2 * math.log1p(r2 / c2)
+        w = w / (1.0 + r2 / c2)
+        for i in range(N_POSE):
+            k0 = w * (jac[0, i] * i00 + jac[1, i] * i01)
+            k1 = w * (jac[0, i] * i01 + jac[1, i] * i11)
+            rhs[i] += w * (jac[0, i] * sx + jac[1, i] * sy)
+            for j in range(i, N_POSE):
+                hess[i, j] += k0 * jac[0, j] + k1 * jac[1, j]
+    for i in range(N_POSE):
+        for j in range(i):
+            hess[i, j] = hess[j, i]
+    return hess, rhs, cost

@@ -1,0 +1,69 @@
+"""Which keyframes see the same by their poses: predicted overlap and image motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.se3 import inverse
+from .keyframe_graph import KeyframeGraph
+
+Array = NDArray[Any]
+
+
+def overlap(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[float, float]:
+    """(share of keyframe i's points inside the view, their median image motion / width) under current poses."""
+    share, motion = overlaps(graph, i, cam_from_world[None])
+    return float(share[0]), float(motion[0])
+
+
+def overlaps(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[Array, Array]:
+    """The same for m views (m, 4, 4): shares (m,) and motions (m,), inf where nothing is in view."""
+    block, camera = graph.variables[i], graph.camera().pinhole
+    px = block.px[::4]
+    points = camera.rays(px) / block.inv_depth[::4, None]
+    view_from_ref = cam_from_world @ inverse(block.cam_from_world)
+    moved = points @ view_from_ref[:, :3, :3].transpose(0, 2, 1) + view_from_ref[:, None, :3, 3]
+    front = moved[..., 2] > 1e-3
+    seen = camera.project(np.where(front[..., None], moved, 1.0).reshape(-1, 3)).reshape(*front.shape, 2)
+    inside = front & (seen >= 0).all(2) & (seen[..., 0] < camera.width) & (seen[..., 1] < camera.height)
+    moved_px = np.where(inside, np.linalg.norm(seen - px, axis=2), np.nan)
+    motion = np.full(len(inside), np.inf)
+    some = inside.any(1)
+    motion[some] = np.nanmedian(moved_px[some], axis=1) / camera.width
+    return inside.mean(1), motion
+
+
+def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_overlap: float) -> list[int]:
+    """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours."""
+    pose = graph.variables[kf_id].cam_from_world
+    found = []
+    for k in graph.members():
+        if k >= before:
+            break
+        share, motion = overlap(graph, k, pose)
+        if share >= min_overlap and motion < 0.5:
+            found.append((motion, k))
+    chosen: list[int] = []
+    for _, k in sorted(found):
+        if len(chosen) == most:
+            break
+        if all(abs(k - c) > 1 for c in chosen):
+            chosen.append(k)
+    return chosen
+
+
+def nearest_keyframe(
+    graph: KeyframeGraph, cam_from_world: Array, but: int, min_overlap: float, max_motion: float
+) -> int | None:
+    """The keyframe of the submap being tracked, other than ``but``, with the least image motion to a view."""
+    best = None
+    for k in graph.members():
+        if k == but:
+            continue
+        share, motion = overlap(graph, k, cam_from_world)
+        if share >= min_overlap and motion <= max_motion and (best is None or motion < best[0]):
+            best = (motion, k)
+    return None if best is None else best[1]

@@ -1,0 +1,37 @@
+"""The unknowns of a keyframe, and the matches that tie two of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass
+class ReprojectionFactor:
+    """Matches of host i's grid pixels in keyframe j."""
+
+    i: int
+    j: int
+    target: Array  # (p, 2) float64 pixels in j
+    weight: Array  # (p,) float64, 0 = no match
+
+
+@dataclass
+class KeyframeVariables:
+    """One keyframe in the problem."""
+
+    px: Array  # (p, 2)
+    inv_depth: Array  # (p,)
+    prior_depth: Array  # (p,)
+    prior_info: Array  # (p,) information of prior_depth
+    cam_from_world: Array  # (4, 4)
+    depth_info: Array = field(default_factory=lambda: np.zeros(0))  # (p,) H_dd of the last solve
+
+
+Variables = dict[int, KeyframeVariables]  # by keyframe
+Factors = dict[int, list[ReprojectionFactor]]  # by anchor keyframe

@@ -1,0 +1,130 @@
+"""Drift spread over a chain of keyframes once a place is seen again: first of the scale, then of the poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.sparse.linalg import spsolve
+
+from ..geometry.se3 import adjoint, inverse, se3_exp, se3_log
+from .keyframe_graph import KeyframeGraph
+
+Array = NDArray[Any]
+ITERATIONS = 15
+
+
+@dataclass(frozen=True)
+class Loop:
+    """Keyframe j seen again from keyframe i, far apart in time."""
+
+    i: int
+    j: int
+    j_from_i: Array  # (4, 4) in i's lengths
+    scale: float  # i's lengths per length of j
+    matches: float  # weighted matches
+
+
+@dataclass(frozen=True)
+class _Link:
+    i: int
+    j: int
+    j_from_i: Array
+    log_scale: float
+    weight: float
+    is_loop: bool = False
+
+
+def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
+    """Move and stretch the keyframes of the submap being tracked so that the loops close. The first one stays.
+
+    CovisibilityEdges are the edges with their present relative poses, and the loops. A link counts by the square of its
+    matches, since one that had few was also at the limit of what can be followed: drift goes there. Scale first,
+    which is linear: minimise the sum of w (x_j - x_i - log s)², x the log of a keyframe's factor. Then the poses,
+    with the links' translations stretched: Gauss-Newton on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
+    """
+    ids = graph.members()
+    row = {k: n for n, k in enumerate(ids)}
+    links = _odometry(graph, row)
+    links += [_Link(row[x.i], row[x.j], x.j_from_i, np.log(x.scale), x.matches**2, True) for x in loops]
+    factor = np.exp(_log_factors(len(ids), links))
+    for k, n in row.items():
+        graph.rescale([k], float(factor[n]))
+    for n, link in enumerate(links):
+        pose = link.j_from_i.copy()
+        # a loop was measured in i's lengths, an edge belongs to both of its ends
+        pose[:3, 3] *= factor[link.i] if link.is_loop else np.sqrt(factor[link.i] * factor[link.j])
+        links[n] = replace(link, j_from_i=pose)
+    depth = 1 / np.median([graph.median_inv_depth(k) for k in ids])
+    poses = _solve_poses(_chained(graph.variables[ids[0]].cam_from_world, len(ids), links), links, float(depth))
+    for k, n in row.items():
+        graph.variables[k].cam_from_world = poses[n]
+
+
+def _odometry(graph: KeyframeGraph, row: dict[int, int]) -> list[_Link]:
+    """One link for each connected pair, with the pose that the graph has now; neighbours are always held a little."""
+    ids = sorted(row)
+    seen = dict.fromkeys(pairwise(ids), 1.0)
+    for e in graph.edges:
+        if e.i in row and e.j in row:
+            pair = (min(e.i, e.j), max(e.i, e.j))
+            seen[pair] = max(seen.get(pair, 0.0), float(e.weight.sum()))
+    poses = {k: graph.variables[k].cam_from_world for k in row}
+    return [_Link(row[i], row[j], poses[j] @ inverse(poses[i]), 0.0, w**2) for (i, j), w in seen.items()]
+
+
+def _log_factors(n: int, links: list[_Link]) -> Array:
+    """(n,) log of every keyframe's factor; the first one's is 0."""
+    i, j = np.array([x.i for x in links]), np.array([x.j for x in links])
+    weight = np.array([x.weight for x in links]) / np.mean([x.weight for x in links])
+    wanted = weight * np.array([x.log_scale for x in links])
+    rows, ones = np.arange(len(links)), np.ones(len(links))
+    jac = csr_array(coo_array((np.r_[ones, -ones], (np.r_[rows, rows], np.r_[j, i])), shape=(len(links), n)))
+    hess = (jac.T @ diags_array(weight) @ jac)[1:, 1:] + 1e-9 * diags_array(np.ones(n - 1))
+    return np.r_[0.0, np.atleast_1d(spsolve(hess.tocsc(), (jac.T @ wanted)[1:]))]
+
+
+def _chained(first: Array, n: int, links: list[_Link]) -> list[Array]:
+    """Poses along the strongest edges, loops left out."""
+    steps = {(x.i, x.j): x for x in links if not x.is_loop}
+    cost = coo_array(([1 / max(x.weight, 1e-9) for x in steps.values()], tuple(np.array([*steps]).T)), shape=(n, n))
+    order, before = breadth_first_order(minimum_spanning_tree(csr_array(cost)), 0, directed=False)
+    poses = [first] * n
+    for k in order[1:]:
+        b = int(before[k])
+        link = steps.get((b, int(k)))
+        poses[k] = (link.j_from_i if link is not None else inverse(steps[int(k), b].j_from_i)) @ poses[b]
+    return poses
+
+
+def _solve_poses(poses: list[Array], links: list[_Link], depth: float) -> list[Array]:
+    """Gauss-Newton on the links; a translation of the scene's depth counts like a turn of one radian."""
+    n = len(poses)
+    unit = np.r_[np.full(3, 1 / depth), np.ones(3)] ** 2
+    mean = np.mean([x.weight for x in links])
+    for _ in range(ITERATIONS):
+        rows, cols, values, rhs = [], [], [], np.zeros(6 * n)
+        for x in links:
+            found = poses[x.j] @ inverse(poses[x.i])
+            residual, jac_i = se3_log(found @ inverse(x.j_from_i)), -adjoint(found)
+            w = unit * x.weight / mean
+            parts = ((x.i, jac_i), (x.j, np.eye(6)))
+            for a, jac_a in parts:
+                rhs[6 * a : 6 * a + 6] -= jac_a.T @ (w * residual)
+                for b, jac_b in parts:
+                    r, c = np.meshgrid(np.arange(6 * a, 6 * a + 6), np.arange(6 * b, 6 * b + 6), indexing="ij")
+                    rows.append(r.ravel())
+                    cols.append(c.ravel())
+                    values.append((jac_a.T @ (w[:, None] * jac_b)).ravel())
+        hess = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(6 * n, 6 * n))
+        inner = csr_array(hess)[6:, 6:] + 1e-9 * diags_array(np.ones(6 * n - 6))
+        step = np.r_[np.zeros(6), spsolve(inner.tocsc(), rhs[6:])]
+        poses = [se3_exp(step[6 * k : 6 * k + 6]) @ p for k, p in enumerate(poses)]
+        if np.abs(step).max() < 1e-7:
+            break
+    return poses

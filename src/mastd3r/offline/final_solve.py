@@ -1,0 +1,125 @@
+"""After the last frame: the joint optimisation over everything, then every frame's pose and the static cloud."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..alignment.reproject import StaticMatches, solve_pose
+from ..config import Config
+from ..errors import InputError
+from ..geometry.se3 import interpolate, inverse
+from ..graph.initialisation import bootstrap
+from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
+from ..graph.submaps import bridge_submaps
+from ..types import State, Trajectory
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class FinalFrame:
+    """One frame at the end of a run."""
+
+    record: FrameRecord
+    world_from_cam: Array  # (4, 4); NaN where there is none
+    state: State
+
+
+def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = True) -> bool:
+    """Start what never started, then optimise everything. False where nothing ever started.
+
+    ``needs_motion``: depth comes from the camera's motion; InputError is raised for one that never moves.
+    """
+    if not graph.started and (len(graph.members()) < 2 or not bootstrap(graph)):
+        if not needs_motion:
+            return False
+        raise InputError(
+            f"the camera never moves enough: expected image motion of at least "
+            f"{config.tracking.first_motion_ratio:.0%} of the image with parallax, got "
+            f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
+        )
+    graph.solve_all(config.graph.final_iterations // 2, 1.0)
+    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    for first, last in bridge_submaps(graph):
+        log.warning("frames %d to %d were never joined to the rest: placed by continuity", first, last)
+    log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
+             len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
+    return True
+
+
+def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
+    """Every frame's pose from its kept matches and the final depths; lost ones between tracked ones interpolated."""
+    out: list[FinalFrame] = []
+    guess, kf_before = np.eye(4), -1
+    for record in graph.records:
+        guess = guess if record.kf_id == kf_before else np.eye(4)
+        kf_before = record.kf_id
+        if record.state == "lost":
+            out.append(FinalFrame(record, np.full((4, 4), np.nan), "lost"))
+            continue
+        guess = np.eye(4) if record.is_keyframe else _refined(graph, record, guess)
+        record.cam_from_kf = guess
+        cam_from_world = guess @ graph.variables[record.kf_id].cam_from_world
+        out.append(FinalFrame(record, inverse(cam_from_world), record.state))
+    return _bridged(out)
+
+
+def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
+    if len(record.points) < 20:
+        return guess
+    matches = kept_matches(graph, record)
+    near = solve_pose(matches, guess, kernel_px=3.0).new_from_ref
+    return solve_pose(matches, near, kernel_px=1.0).new_from_ref
+
+
+def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:
+    """The matches that a frame kept of its keyframe, with the keyframe's depths as they are now."""
+    block, keep = graph.variables[record.kf_id], record.points
+    return StaticMatches(
+        block.px[keep],
+        block.inv_depth[keep],
+        graph.depth_info(record.kf_id)[keep],
+        record.target.astype(float),
+        record.weight.astype(float),
+        graph.intrinsics.values,
+    )
+
+
+def _bridged(frames: list[FinalFrame]) -> list[FinalFrame]:
+    """Poses for lost frames: between two tracked ones by interpolation, at the ends by standing still."""
+    good = [n for n, f in enumerate(frames) if f.state != "lost"]
+    if not good:
+        return frames
+    out = list(frames)
+    for n, f in enumerate(frames):
+        if f.state != "lost":
+            continue
+        before = max((g for g in good if g < n), default=None)
+        after = min((g for g in good if g > n), default=None)
+        if before is None or after is None:
+            nearest = before if before is not None else after
+            assert nearest is not None
+            pose = frames[nearest].world_from_cam
+        else:
+            a, b = frames[before], frames[after]
+            span = b.record.timestamp_s - a.record.timestamp_s
+            ratio = (f.record.timestamp_s - a.record.timestamp_s) / span if span > 0 else 0.5
+            pose = interpolate(a.world_from_cam, b.world_from_cam, ratio)
+        out[n] = FinalFrame(f.record, pose, "interpolated")
+    return out
+
+
+def trajectory_of(frames: list[FinalFrame]) -> Trajectory:
+    """All frames as a trajectory."""
+    return Trajectory(
+        np.array([f.record.timestamp_s for f in frames]),
+        np.stack([f.world_from_cam for f in frames]) if frames else np.zeros((0, 4, 4)),
+        tuple(f.state for f in frames),
+        np.array([f.record.is_keyframe for f in frames], bool),
+    )

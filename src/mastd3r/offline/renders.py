@@ -1,0 +1,119 @@
+"""What is shown of a finished map beside its renders: depth images and the flight; from a run, or from its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from ..camera.map_view import MapView
+from ..camera.opencv_lens import OpenCvLens
+from ..camera.pinhole import Camera
+from ..config import HOLDOUT_EVERY, Config, config_from_dict
+from ..errors import InputError
+from ..export.files import writing
+from ..export.read_run import Run, read_run
+from ..export.run_folder import write_depth_png
+from ..export.video import write_video
+from ..geometry.path import smoothed_path
+from ..mapping.ply import read_gaussians_ply
+from ..mapping.splat import Splat
+from ..mapping.spz import write_gaussians_spz
+
+Array = NDArray[Any]
+Draw = Callable[[Array, Camera], tuple[Array, Array, Array]]
+FLIGHT_FPS = 30
+FLIGHT_WIDTH_PX = 480
+FLIGHT_S = (2.0, 10.0)  # the flight is as long as the video, within these
+FLIGHT_SIGMA_RATIO = 0.02  # of the video's length: what the path is smoothed over
+DEPTH_RANGE = 16  # times the median depth that a depth image must hold
+
+
+def depth_png_per_unit(median_depth: float) -> float:
+    """Steps of a 16-bit depth image a map unit: a power of two, so that 16 median depths fit."""
+    return float(2.0 ** np.floor(np.log2(65535 / (DEPTH_RANGE * median_depth))))
+
+
+def flight_path(times_s: Array, world_from_cam: Array) -> Array:
+    """(m, 4, 4) poses of the flight: the given trajectory, smoothed, evenly in time. InputError without a pose."""
+    known = np.isfinite(world_from_cam).all((1, 2))
+    times_s, world_from_cam = times_s[known], world_from_cam[known]
+    if len(times_s) == 0:
+        raise InputError("flight: expected a trajectory with at least one pose, got none")
+    length_s = float(times_s[-1] - times_s[0])
+    count = round(float(np.clip(length_s, *FLIGHT_S)) * FLIGHT_FPS)
+    at_s = np.linspace(times_s[0], times_s[-1], count)
+    spacing_s = length_s / max(1, len(times_s) - 1)
+    return smoothed_path(times_s, world_from_cam, at_s, max(FLIGHT_SIGMA_RATIO * length_s, spacing_s, 1e-6))
+
+
+def write_flight(
+    path: Path, draw: Draw, camera: Camera, poses: Array, advance: Callable[[], None] | None = None
+) -> str:
+    """The splat along a path as a video, with the lens ``camera`` (a pinhole); names the codec. Raises OutputError."""
+
+    def frames() -> Iterator[Array]:
+        for pose in poses:
+            yield draw(pose, camera)[0]
+            if advance is not None:
+                advance()
+
+    return write_video(path, frames(), FLIGHT_FPS)
+
+
+def flight_camera(full: Camera | OpenCvLens) -> Camera:
+    """The flight's pinhole: the photograph's field of view, at the width of a small video."""
+    width = min(FLIGHT_WIDTH_PX, full.width)
+    return full.pinhole.resized(width, max(2, round(full.height * width / full.width)))
+
+
+def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
+    """``mastd3r export --to spz|flight|depth``: the splat of a run folder; gives the path written.
+
+    spz: a file. flight: an .mp4. depth: a folder of 16-bit images at the poses of the holdout frames, as ``depth/`` of
+    the run folder is. Raises InputError for a run without a map, OutputError where ``out`` cannot be written.
+    """
+    run = read_run(run_dir)
+    gaussians = read_gaussians_ply(run_dir / "gaussians.ply")
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    if kind == "spz":
+        write_gaussians_spz(out, gaussians)
+        return out
+    lens, facts = _lens(run), _facts(run)
+    splat = Splat(gaussians, facts["near"], facts["background"])
+    if kind == "flight":
+        poses = flight_path(run.trajectory.timestamps_s, run.trajectory.world_from_cam)
+        write_flight(out, splat.render, flight_camera(lens), poses)
+        return out
+    with writing(out):
+        out.mkdir(exist_ok=True)
+    mapping = (config_from_dict(yaml.safe_load(run.config) or {}) if run.config else Config()).mapping
+    map_view = MapView(lens, mapping.width_px, mapping.tau_uncertainty_px)
+    times_s, per_unit = run.trajectory.timestamps_s, depth_png_per_unit(facts["median_depth"])
+    for time_s, pose in list(zip(times_s, run.trajectory.world_from_cam, strict=True))[::HOLDOUT_EVERY]:
+        if np.isfinite(pose).all():
+            depth = splat.render(pose, map_view.pinhole)[1]
+            write_depth_png(out, float(time_s), map_view.depth_as_photograph(depth), per_unit)
+    return out
+
+
+def _lens(run: Run) -> Camera | OpenCvLens:
+    """The lens of camera.json; one with more than radial terms is OpenCV's."""
+    c = run.camera
+    if c is None:
+        raise InputError(f"{run.path}: expected camera.json, which drawing the splat needs, got none")
+    if not any(run.distortion[2:4] + run.distortion[5:]):
+        return c
+    return OpenCvLens(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height, run.distortion)
+
+
+def _facts(run: Run) -> dict[str, Any]:
+    facts = run.record.get("map")
+    if not isinstance(facts, dict) or not {"near", "background", "median_depth"} <= set(facts):
+        raise InputError(f"{run.path}/run.json: expected what was written of the map (key map), got none")
+    return facts

@@ -1,0 +1,61 @@
+"""The static cloud: keyframe points that stand still and that something supports."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..graph.depth import depth_confidence, inpainted
+from ..graph.keyframe_graph import KeyframeGraph
+from ..types import StaticCloud
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+def static_cloud(graph: KeyframeGraph, colors: dict[int, Array], moving: dict[int, Array]) -> StaticCloud:
+    """Fused static points of the keyframes in ``colors``: (p, 3) uint8 at each keyframe's px; ``moving`` (p,).
+
+    Moving points and points without support are pruned. A pixel whose own depth is unsure stands at its
+    neighbours' depth, with the confidence halved.
+    """
+    camera = graph.camera()
+    parts = []
+    for k, color in colors.items():
+        block, kf = graph.variables[k], graph.keyframes[k]
+        info = graph.depth_info(k)
+        own = depth_confidence(block.inv_depth, info)
+        inv_depth = inpainted(block.inv_depth, info, kf.work.grid)
+        support = inpainted(np.maximum(own, 1e-3), np.full(len(own), 1e12), kf.work.grid)
+        confidence = np.where(own > 0.5, own, 0.5 * support) * (1 - moving[k])
+        keep = (confidence > 0.05) & (moving[k] < 0.5) & (inv_depth > 0.02 * np.median(inv_depth))
+        depth = 1 / np.maximum(inv_depth, 1e-9)
+        points_cam = camera.rays(block.px) * depth[:, None]
+        pose = graph.world_from_cam(k)
+        cell = graph.size[0] / kf.work.grid[1]
+        parts.append(
+            (
+                (points_cam @ pose[:3, :3].T + pose[:3, 3])[keep],
+                color[keep],
+                confidence[keep],
+                (depth * cell / camera.fx_px)[keep],
+                np.full(int(keep.sum()), k),
+            )
+        )
+    if not parts:
+        return StaticCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), *_no_points())
+    points, color, confidence, spacing, kf_id = (np.concatenate(c) for c in zip(*parts, strict=True))
+    return StaticCloud(
+        points.astype(np.float32),
+        color.astype(np.uint8),
+        confidence.astype(np.float32),
+        spacing.astype(np.float32),
+        kf_id.astype(np.int32),
+    )
+
+
+def _no_points() -> tuple[Array, Array, Array]:
+    return np.zeros(0, np.float32), np.zeros(0, np.float32), np.zeros(0, np.int32)

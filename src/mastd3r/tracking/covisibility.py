@@ -1,0 +1,100 @@
+"""Matches between keyframes: what a new one is tied to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from numpy.typing import NDArray
+
+from ..concurrency import on_two_threads
+from ..config import GraphConfig
+from ..dynamics.soft_mask import static_at
+from ..graph.covisibility import covisible
+from ..graph.factors import ReprojectionFactor
+from ..graph.keyframe_graph import Keyframe, KeyframeGraph
+from ..graph.prediction import rigid_flow
+from ..parts import Parts
+from ..pointmap.flow_maps import chained_flow, invert_flow
+from ..types import Guess
+
+Array = NDArray[Any]
+
+
+class CovisibilityEdges:
+    """Makes edges of a graph. Before there are poses, the flows between keyframes are kept as starts of the next."""
+
+    def __init__(self, config: GraphConfig, parts: Parts) -> None:
+        self.config, self.parts = config, parts
+        self.flows: dict[tuple[int, int], Array] = {}  # between keyframes, before there are poses
+
+    def tie(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> KeyframeGraph:
+        """Matches of ``kf`` with the keyframes before ``before`` and older ones that see the same; the window solved.
+
+        ``graph`` has poses; it is returned.
+        """
+        recent = self.to_recent(graph, kf, before)
+        c = self.config
+        older = covisible(graph, kf.id, min(recent, default=before), c.covisible, c.loop_overlap_ratio)
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
+        for k in older:
+            self.both(graph, k, kf.id)
+        graph.solve_window()
+        return graph
+
+    def to_recent(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> list[int]:
+        """Matches with the ``neighbours`` last keyframes; those but ``before``, with which there are some already."""
+        recent = [k for k in graph.members()[-2 - self.config.neighbours : -1] if k != before]
+        self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before, *reversed(recent))])
+        for k in reversed(recent):
+            self.both(graph, k, kf.id)
+        return recent
+
+    def both(self, graph: KeyframeGraph, i: int, j: int) -> bool:
+        """Edges both ways; False where one fails, or where nothing says how to start."""
+        found = self._found(graph, i, j)
+        graph.edges += found
+        return len(found) == 2
+
+    def many(self, graph: KeyframeGraph, pairs: Sequence[tuple[int, int]]) -> int:
+        """``both`` of many pairs, in this order; how many have edges both ways. ``graph`` has poses."""
+
+        def search(pair: tuple[int, int]) -> list[ReprojectionFactor]:
+            return self._found(graph, *pair)
+
+        side_by_side = self.parts.provider.side_by_side
+        found = on_two_threads(search, pairs) if side_by_side else [search(pair) for pair in pairs]
+        for edges in found:
+            graph.edges += edges
+        return sum(len(edges) == 2 for edges in found)
+
+    def one(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
+        """The edge of i's pixels in j, searched from ``flow`` (h, w, 2)."""
+        edge = self._edge(graph, i, j, flow)
+        if edge is not None:
+            graph.edges.append(edge)
+        return edge is not None
+
+    def _found(self, graph: KeyframeGraph, i: int, j: int) -> list[ReprojectionFactor]:
+        """Edges both ways, not yet added; the way back is searched where there is one there."""
+        grid_px = self.parts.grid_px
+        if graph.initialised:
+            start, back = rigid_flow(graph, i, j), rigid_flow(graph, j, i)
+        elif (i, j - 1) in self.flows and (j - 1, j) in self.flows:
+            start = chained_flow(self.flows[i, j - 1], self.flows[j - 1, j], grid_px)
+            back = invert_flow(start, grid_px)
+        else:
+            return []
+        there = self._edge(graph, i, j, start)
+        if there is None:
+            return []
+        again = self._edge(graph, j, i, back)
+        return [there] if again is None else [there, again]
+
+    def _edge(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> ReprojectionFactor | None:
+        ref, new = graph.keyframes[i], graph.keyframes[j]
+        guess = Guess(graph.camera(), flow=flow, flow_is_near=graph.initialised)
+        pair = self.parts.provider.predict(ref.work, new.work, guess)
+        if not graph.initialised:
+            self.flows[i, j] = pair.flow
+        return graph.edge(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))

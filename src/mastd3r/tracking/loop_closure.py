@@ -1,0 +1,110 @@
+"""After the last frame: places seen again, by their looks where the map has drifted, by their poses elsewhere."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..concurrency import Future
+from ..dynamics.soft_mask import static_at
+from ..geometry.se3 import inverse, so3_log
+from ..graph.covisibility import overlaps
+from ..graph.keyframe_graph import KeyframeGraph
+from ..graph.place_recognition import PlaceRecognition
+from ..graph.pose_graph import Loop, optimise_pose_graph
+from ..graph.submaps import scale_between
+from .two_view import TwoView, TwoViewEstimator
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+MIN_SIMILARITY = 0.55  # of two descriptors, for a pair to be looked at
+APART = 3  # keyframes between two of one place, below: they are neighbours
+MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be believed
+SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
+MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
+WIDE_OVERLAP, WIDE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
+WIDE_PAIRS = 4  # of those for each keyframe, at most
+
+
+def close_loops(comparer: TwoViewEstimator, graph: KeyframeGraph, places: PlaceRecognition) -> list[Loop]:
+    """Keyframes of the submap being tracked that look alike, far apart in time: verified both ways, and closed.
+
+    Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised.
+    """
+    found: list[Loop] = []
+    ids, joined = graph.members(), graph.connected_pairs()
+    for j in ids:
+        kf = graph.keyframes[j]
+        far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
+        for other in places.best(graph, kf.work, far, 2, MIN_SIMILARITY):
+            there = comparer.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
+            back = comparer.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
+            loop = _loop(graph, other.id, j, there, back)
+            if loop is None or there is None or back is None:
+                continue
+            log.info("keyframes %d and %d are one place, scale %.3f", other.id, j, loop.scale)
+            graph.connect(other.id, j, there.pair.matches, static_at(kf.moving / 255.0, there.pair.matches.new_px))
+            graph.connect(j, other.id, back.pair.matches, static_at(other.moving / 255.0, back.pair.matches.new_px))
+            found.append(loop)
+            break
+    if found:
+        optimise_pose_graph(graph, found)
+        graph.solve_all(10, 2.0)
+    return found
+
+
+def _known(found: list[Loop], i: int, j: int) -> bool:
+    """Keyframes next to the ends of a loop are matched later, by their poses."""
+    return any(abs(i - x.i) <= APART and abs(j - x.j) <= APART for x in found)
+
+
+def _strong(view: TwoView | None) -> bool:
+    if view is None or (view.weight > 0.05).sum() < MIN_MATCHES:
+        return False
+    return view.alignment.inlier_ratio >= MIN_INLIERS
+
+
+def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: TwoView | None) -> Loop | None:
+    """What j seen from i and i seen from j agree on; None where they do not."""
+    if there is None or back is None or not (_strong(there) and _strong(back)):
+        return None
+    j_from_i, i_from_j = there.alignment.new_from_ref, back.alignment.new_from_ref
+    scale = scale_between(graph, i, j, j_from_i, there.pair.matches, there.weight)
+    other = scale_between(graph, j, i, i_from_j, back.pair.matches, back.weight)
+    if scale is None or other is None or abs(np.log(scale * other)) > MAX_LOG_SCALE:
+        return None
+    better = there if there.alignment.inlier_ratio >= back.alignment.inlier_ratio else back
+    turn = np.linalg.norm(so3_log(i_from_j[:3, :3] @ j_from_i[:3, :3]))
+    if better.alignment.inlier_ratio < SURE_INLIERS or turn > MAX_TURN:
+        return None
+    scale = float(np.sqrt(scale / other))
+    if better is back:
+        j_from_i = inverse(i_from_j)
+        j_from_i[:3, 3] *= scale
+    return Loop(i, j, j_from_i, scale, float(better.weight.sum()))
+
+
+def widen(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
+    """Match all pairs of keyframes that should see the same by their poses and were not matched before; how many.
+
+    While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time ties
+    the chain together across them. At most ``WIDE_PAIRS`` a keyframe, those that share most first.
+    """
+    ids = graph.members()
+    done = graph.connected_pairs()
+    pairs = []
+    poses = np.stack([graph.variables[k].cam_from_world for k in ids])
+    shared = {i: overlaps(graph, i, poses) for i in ids}
+    for a, i in enumerate(ids):
+        for b, j in enumerate(ids[:a]):
+            share = min(shared[i][0][b], shared[j][0][a])
+            motion = max(shared[i][1][b], shared[j][1][a])
+            if share >= WIDE_OVERLAP and motion <= WIDE_MOTION and frozenset((i, j)) not in done:
+                pairs.append((-share, j, i))
+    made = connect([(i, j) for _, i, j in sorted(pairs)[: WIDE_PAIRS * len(ids)]])
+    log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
+    return made
