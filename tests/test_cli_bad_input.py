@@ -15,9 +15,10 @@ import numpy as np
 import pytest
 
 from helpers import write_video
-from mastd3r import reconstruct as run_module
+from mastd3r import pipeline
 from mastd3r.cli.main import main
 from mastd3r.export import files
+from mastd3r.offline import job
 from mastd3r.types import Frame
 
 
@@ -319,8 +320,8 @@ class Interrupted:
 
 
 def test_ctrl_c_keeps_what_was_computed(mastd3r: Command, room_clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened = run_module.open_source
-    monkeypatch.setattr(run_module, "open_source", lambda *a, **k: Interrupted(opened(*a, **k), 20))
+    opened = pipeline.open_source
+    monkeypatch.setattr(pipeline, "open_source", lambda *a, **k: Interrupted(opened(*a, **k), 20))
     said = mastd3r(room_clip)
     assert said.code == 130
     assert len(said.err) == 1 and said.err[0].startswith("mastd3r: stopped")
@@ -355,14 +356,14 @@ def test_a_disk_that_is_full_from_the_start(mastd3r: Command, room_clip: Path, m
 
 def test_a_disk_that_fills_up_for_good(mastd3r: Command, room_clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing can be written any more, not even why: still one line and exit code 2."""
-    finish = run_module.finish_graph
+    finish = job.finish_graph
 
     def then_full(*args: Any, **options: Any) -> bool:
         found = finish(*args, **options)
         full_disk(monkeypatch, None)
         return found
 
-    monkeypatch.setattr(run_module, "finish_graph", then_full)
+    monkeypatch.setattr(job, "finish_graph", then_full)
     mastd3r(room_clip, "--end", "18").refused("No space left on device", "free some space")
 
 

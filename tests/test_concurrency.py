@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from mastd3r import reconstruct as run_module
+from mastd3r import pipeline
 from mastd3r.concurrency import Future, Worker, one_blas_thread, prefetch
 from mastd3r.config import Config
 from mastd3r.errors import SlamError
-from mastd3r.parts import Parts
+from mastd3r.parts import parts_of
+from mastd3r.tracking.observation import Observer
 from mastd3r.types import WorkFrame
 from test_pointmap_mast3r import TrueNetwork, photograph, provider_of
 
@@ -81,7 +82,8 @@ def test_frames_seen_ahead_are_those_seen_in_turn(prefetches_pairs: bool) -> Non
     outcome = []
     for looks_ahead in (True, False):
         network = TrueNetwork()
-        parts = Parts(provider_of(network), (160, 120), prefetches_pairs=prefetches_pairs)
+        provider = provider_of(network, prefetches_pairs=prefetches_pairs)
+        observer = Observer(parts_of(provider, Config()))
         keyframe: list[WorkFrame | None] = [None]
 
         def near(keyframe: list[WorkFrame | None] = keyframe) -> object:
@@ -89,8 +91,8 @@ def test_frames_seen_ahead_are_those_seen_in_turn(prefetches_pairs: bool) -> Non
             return lambda _: followed
 
         works = []
-        for frame in parts.prefetched(iter(frames), near) if looks_ahead else iter(frames):  # type: ignore[arg-type]
-            works.append(parts.observe(frame, keyframe[0]))
+        for frame in observer.prefetched(iter(frames), near) if looks_ahead else iter(frames):  # type: ignore[arg-type]
+            works.append(observer.observe(frame, keyframe[0]).work)
             if frame.index in (0, 4):
                 keyframe[0] = works[-1]
         outcome.append((works, network.encoded, network.decoded))
@@ -123,8 +125,8 @@ def test_a_run_has_one_blas_thread(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         seen.extend(blas_threads())
         raise Stopped
 
-    monkeypatch.setattr(run_module, "_job", job)
-    for call in (run_module.run, run_module.material_for_map):
+    monkeypatch.setattr(pipeline, "_slam_of", job)
+    for call in (pipeline.reconstruct, pipeline.material_for_map):
         with threadpool_limits(limits=2, user_api="blas"), pytest.raises(Stopped):
             call(tmp_path, tmp_path / "out", Config())
     assert set(seen) == {1}

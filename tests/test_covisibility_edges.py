@@ -1,4 +1,4 @@
-"""Ties of a new keyframe, made beside tracking: taken at the same frame however long they took."""
+"""Edges of a new keyframe, made beside tracking: taken at the same frame however long they took."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from mastd3r.graph.keyframe_graph import Keyframe, KeyframeGraph
 from mastd3r.pointmap.geometric import GeometricPointmaps
-from mastd3r.slam import EDGES_AFTER
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.tracking.covisibility import CovisibilityEdges
+from mastd3r.tracking.keyframes import EDGES_AFTER
 from mastd3r.types import WorkFrame
 from test_chain import turning_fast
 from test_graph_keyframes import graph_of
@@ -30,16 +30,16 @@ def room() -> list[SyntheticView]:
 
 
 def watched(monkeypatch: pytest.MonkeyPatch, wait_s: float) -> list[tuple[int, str]]:
-    """What is tied from here on: (keyframe, thread's name). Each tie takes at least ``wait_s``."""
+    """What is connected from here on: (keyframe, thread's name). Each takes at least ``wait_s``."""
     seen: list[tuple[int, str]] = []
-    tie = CovisibilityEdges.tie
+    connect = CovisibilityEdges.connect
 
     def slow(self: CovisibilityEdges, graph: KeyframeGraph, kf: Keyframe, before: int) -> KeyframeGraph:
         time.sleep(wait_s)
         seen.append((kf.id, threading.current_thread().name))
-        return tie(self, graph, kf, before)
+        return connect(self, graph, kf, before)
 
-    monkeypatch.setattr(CovisibilityEdges, "tie", slow)
+    monkeypatch.setattr(CovisibilityEdges, "connect", slow)
     return seen
 
 
@@ -47,7 +47,7 @@ def poses(run: Played) -> Array:
     return np.stack([f.world_from_cam for f in run.final])
 
 
-def test_the_result_does_not_depend_on_how_long_ties_take(
+def test_the_result_does_not_depend_on_how_long_edges_take(
     room: list[SyntheticView], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     quick = watched(monkeypatch, 0.0)
@@ -55,19 +55,19 @@ def test_the_result_does_not_depend_on_how_long_ties_take(
     monkeypatch.undo()
     slow = watched(monkeypatch, 0.4)
     second = play(room)
-    assert quick == slow and sum(thread.startswith("ties") for _, thread in slow) >= 2
+    assert quick == slow and sum(thread.startswith("edges") for _, thread in slow) >= 2
     np.testing.assert_array_equal(poses(first), poses(second))
     assert {(e.i, e.j) for e in first.slam.graph.edges} == {(e.i, e.j) for e in second.slam.graph.edges}
 
 
-def test_where_keyframes_follow_one_another_they_are_tied_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    ties = watched(monkeypatch, 0.0)
+def test_where_keyframes_follow_one_another_they_are_connected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made_where = watched(monkeypatch, 0.0)
     run = play(views_of(36, turning_fast))
     made = {r.kf_id: r.index for r in run.slam.graph.records if r.is_keyframe}
     hurried = [
-        thread for k, thread in ties if made[k] - made[k - 1] < EDGES_AFTER and k >= run.slam.config.graph.window
+        thread for k, thread in made_where if made[k] - made[k - 1] < EDGES_AFTER and k >= run.slam.config.graph.window
     ]
-    assert len(hurried) >= 4 and not any(thread.startswith("ties") for thread in hurried)
+    assert len(hurried) >= 4 and not any(thread.startswith("edges") for thread in hurried)
 
 
 def test_a_provider_that_serves_one_at_a_time_is_asked_in_turn(
@@ -81,9 +81,9 @@ def test_a_provider_that_serves_one_at_a_time_is_asked_in_turn(
 
     monkeypatch.setattr(GeometricPointmaps, "predict", noted)
     monkeypatch.setattr(GeometricPointmaps, "side_by_side", False)
-    ties = watched(monkeypatch, 0.0)
+    made_where = watched(monkeypatch, 0.0)
     run = play(room[:40])
-    assert len(ties) >= 2 and threads == {threading.get_ident()}
+    assert len(made_where) >= 2 and threads == {threading.get_ident()}
     assert run.ate_ratio(np.ones(40, bool)) < 0.005
 
 
@@ -91,13 +91,13 @@ def test_many_pairs_at_once_are_the_pairs_one_by_one(
     room: list[SyntheticView], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = play(room[:40])
-    graph, links = run.slam.graph, run.slam.links
+    graph, edges = run.slam.graph, run.slam.keyframes.edges
     pairs, known = [(0, 4), (1, 6), (0, 7), (2, 5)], len(graph.edges)
-    one_by_one = sum([links.both(graph, i, j) for i, j in pairs])
+    one_by_one = sum([edges.add(graph, i, j) for i, j in pairs])
     expected, graph.edges = graph.edges[known:], graph.edges[:known]
     for side_by_side in (True, False):
         monkeypatch.setattr(GeometricPointmaps, "side_by_side", side_by_side)
-        assert links.many(graph, pairs) == one_by_one >= 2
+        assert edges.add_many(graph, pairs) == one_by_one >= 2
         made, graph.edges = graph.edges[known:], graph.edges[:known]
         assert [(e.i, e.j) for e in made] == [(e.i, e.j) for e in expected]
         for a, b in zip(made, expected, strict=True):

@@ -17,7 +17,7 @@ from mastd3r.graph.covisibility import overlap, overlaps
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
-from mastd3r.tracking.loop_closure import close_loops, widen
+from mastd3r.tracking.loop_closure import add_covisible_pairs, close_loops
 from mastd3r.tracking.two_view import TwoView
 from mastd3r.types import PairPrediction, Pointmap
 
@@ -125,7 +125,7 @@ def test_pairs_that_see_the_same_are_matched_once(scene: Any) -> None:
         asked.extend(pairs)
         return sum(i != 0 for i, _ in pairs)
 
-    made = widen(graph, connect)
+    made = add_covisible_pairs(graph, connect)
     assert made == sum(i != 0 for i, _ in asked) > 0
     assert len(set(asked)) == len(asked) and all(i < j for i, j in asked)
     assert not any(graph.connected(i, j) for i, j in asked)
@@ -162,8 +162,8 @@ class Recognises:
         weight[int(self.spoilt.get("matches", len(weight))) :] = 0.0
         nothing = Pointmap(matches.ref_px, np.zeros((len(weight), 3)), np.zeros(len(weight)))
         flow = np.zeros((self.scene.height, self.scene.width, 2), np.float32)
-        alignment = Alignment(pose, 1.0, True, 3, inliers, 0.3, np.eye(6), ("fine",))
-        return TwoView(PairPrediction(matches, nothing, nothing, None, flow), weight, alignment, 0.1, 200)
+        alignment = Alignment(pose, 1.0, True, 3, inliers, 0.3, ("fine",))
+        return TwoView(kf, PairPrediction(matches, nothing, None, flow), weight, alignment, 0.1, 200)
 
 
 def test_a_loop_is_seen_both_ways_and_closed(scene: Any) -> None:

@@ -24,6 +24,7 @@ from mastd3r.networks.mast3r import Mast3rConfig, random_mast3r
 from mastd3r.networks.pair import PairNetwork
 from mastd3r.offline.smoothing import _at_expected_scale
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host
+from mastd3r.tracking.observation import Observer
 from mastd3r.types import Frame, Guess, Truth
 
 Array = NDArray[Any]
@@ -102,7 +103,7 @@ def test_auto_says_what_it_chose() -> None:
         "pointmaps: geometric, chosen by auto (no MASt3R weights are installed)",
         "semantics: none, chosen by auto (no DINOv2 weights are installed)",
     ]
-    assert built.provider.name == "geometric" and built.semantic is None and built.own_scale_known
+    assert built.provider.name == "geometric" and built.provider.own_scale_known
 
 
 def test_what_the_user_chose_is_not_explained() -> None:
@@ -148,12 +149,13 @@ def test_weights_of_a_path_become_the_provider(tiny: Path) -> None:
     built = parts.build_parts(with_networks(pointmaps="mast3r", mast3r=str(tiny), long_side_px=96), Clip())
     provider = built.provider
     assert isinstance(provider, Mast3rPointmaps) and isinstance(provider.network, PairNetwork)
-    assert built.size == (provider.width, provider.height) == (96, 64)
-    assert provider.matcher is match_on_host and not built.own_scale_known
+    assert provider.size == (provider.width, provider.height) == (96, 64)
+    assert provider.matcher is match_on_host and not provider.own_scale_known
     assert any("tiny.pth" in note and "float32 on cpu" in note for note in built.notes)
     ref = new = None
+    observer = Observer(built)
     for frame in Clip().frames():
-        ref, new = new, built.observe(frame, new)
+        ref, new = new, observer.observe(frame, new).work
     assert ref is not None and new is not None
     said = provider.predict(ref, new, Guess(Camera.centred(100, 96, 64)))
     assert np.isfinite(said.matches.new_px).all()
@@ -217,7 +219,7 @@ def test_dinov2_fills_the_prior_before_the_provider_looks(tmp_path: Path) -> Non
     built = parts.build_parts(with_networks(semantics="dinov2", dinov2=str(tmp_path / "dino")), Clip())
     assert any(note == f"DINOv2: {tmp_path / 'dino'}, float32 on cpu" for note in built.notes)
     for frame in Clip().frames():
-        semantic = built.observe(frame).semantic
+        semantic = Observer(built).observe(frame).work.semantic
         assert semantic is not None and semantic.shape == (64, 96)
         assert semantic.min() >= 0 and semantic.max() <= 1 and semantic.std() > 0.05
         assert frame.semantic is None

@@ -18,10 +18,11 @@ from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.submaps import bridge_submaps, join, scale_between
 from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph
 from mastd3r.parts import Parts, build_parts
-from mastd3r.slam import Slam, StepReport
+from mastd3r.slam import Slam, TrackResult
 from mastd3r.sources import synthetic
 from mastd3r.sources.room import camera_pose
 from mastd3r.sources.synthetic import SyntheticView
+from mastd3r.tracking.state import Status
 from mastd3r.types import Frame
 
 Array = NDArray[Any]
@@ -264,7 +265,7 @@ class Played:
     """A run over frames of the room."""
 
     slam: Slam
-    steps: list[StepReport]
+    steps: list[TrackResult]
     final: list[FinalFrame]
     truth: Array  # (n, 4, 4)
 
@@ -307,12 +308,12 @@ def play(views: list[SyntheticView], dark: range = range(0), motion_ratio: float
     )
     config = replace(Config(), pointmaps="geometric", semantics="none", tracking=t)
     parts: Parts = build_parts(config, Room())  # type: ignore[arg-type]
-    slam = Slam(config, parts, Room.size)
+    slam = Slam(config, Room.size, parts=parts)
     steps = []
     for n, view in enumerate(views):
         image = np.zeros_like(view.frame.image) if n in dark else view.frame.image
-        steps.append(slam.step(Frame(n, n / 10, image)))
-    slam.close()
+        steps.append(slam.track(Frame(n, n / 10, image)))
+    slam.end_tracking()
     finish_graph(slam.graph, config)
     return Played(slam, steps, final_frames(slam.graph), np.stack([v.world_from_cam for v in views]))
 
@@ -334,7 +335,7 @@ def test_forward_and_back_uses_the_keyframes_there_are(room: list[SyntheticView]
     """The way back adds less than a fifth of the keyframes of the way there, and ends where it began: to 1/1000."""
     there_views = room[:36]  # the path turns round by itself behind that
     run = play([*there_views, *there_views[-2::-1]])
-    assert {s.state for s in run.steps} <= {"started", "tracked"}
+    assert {s.state for s in run.steps} <= {Status.INITIALISING, Status.TRACKING}
     there = sum(r.is_keyframe for r in run.slam.graph.records[:36])
     back = sum(r.is_keyframe for r in run.slam.graph.records[36:])
     assert there >= 7 and back < 0.2 * there
@@ -361,8 +362,8 @@ def jerk() -> list[SyntheticView]:
 def test_a_jerk_starts_a_submap_which_is_joined_when_the_place_is_seen_again(jerk: list[SyntheticView]) -> None:
     """Then one map holds all of it, to 1/200 of the path."""
     run = play(jerk, motion_ratio=0.1)
-    assert [s.index for s in run.steps if s.state == "started"] == [0, 30]
-    assert run.steps[30].why.startswith("the view before it cannot be followed")
+    assert [s.index for s in run.steps if s.reason] == [0, 30]
+    assert run.steps[30].reason.startswith("the view before it cannot be followed")
     assert {f.state for f in run.final} <= {"started", "tracked"}
     assert set(run.slam.graph.submap_of.values()) == {0} and run.slam.graph.started == {0}
     every = np.ones(64, bool)

@@ -11,8 +11,7 @@ from known_pair import look
 from mastd3r.concurrency import Future
 from mastd3r.config import Config
 from mastd3r.geometry.se3 import inverse, so3_log
-from mastd3r.graph.place_recognition import PlaceRecognition
-from mastd3r.parts import Parts
+from mastd3r.parts import parts_of
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
 from mastd3r.types import Frame, Guess
@@ -40,12 +39,12 @@ def test_a_network_recognises_without_corner_features(time_s: float) -> None:
     network = TrueNetwork(noise=0.1)
     network.scale = {time_s: 1.3}
     provider = provider_of(network)
-    parts = Parts(provider, (160, 120), places=PlaceRecognition(provider.place_descriptor), own_scale_known=False)
+    parts = parts_of(provider, Config())
     parts.features = NoFeatures(allowed=False)  # type: ignore[assignment]
-    slam = Slam(Config(), parts, FULL)
-    slam.step(photograph(0.0))
+    slam = Slam(Config(), FULL, parts=parts)
+    slam.track(photograph(0.0))
     keyframe = slam.graph.keyframes[0]
-    view = slam.comparer.relocalised(keyframe, provider.observe(photograph(time_s)), NOTHING_MOVES)
+    view = slam.two_view.relocalised(keyframe, provider.observe(photograph(time_s)), NOTHING_MOVES)
     assert view is not None
     truth = inverse(look(time_s).world_from_cam) @ look(0.0).world_from_cam
     error = view.alignment.new_from_ref @ inverse(truth)
@@ -56,34 +55,34 @@ def test_a_network_recognises_without_corner_features(time_s: float) -> None:
 
 
 def test_without_a_network_features_start_the_flow() -> None:
-    parts = Parts(GeometricPointmaps(160, 120, 8), (160, 120))
+    parts = parts_of(GeometricPointmaps(160, 120, 8), Config())
     features = parts.features = NoFeatures(allowed=True)  # type: ignore[assignment]
-    slam = Slam(Config(), parts, FULL)
-    slam.step(photograph(0.0))
-    work = parts.observe(photograph(0.1))
-    assert slam.comparer.relocalised(slam.graph.keyframes[0], work, NOTHING_MOVES) is None
+    slam = Slam(Config(), FULL, parts=parts)
+    slam.track(photograph(0.0))
+    work = parts.provider.observe(photograph(0.1))
+    assert slam.two_view.relocalised(slam.graph.keyframes[0], work, NOTHING_MOVES) is None
     assert isinstance(features, NoFeatures) and features.asked == 1
 
 
 def test_where_few_match_features_are_asked_and_the_better_start_is_kept() -> None:
     """A jump of a quarter of the width: flow alone finds little, features find it, a wrong start is not taken."""
     ref, new, _ = pair_of(np.eye(2), np.array([-80.0, 8.0]))
-    parts = Parts(GeometricPointmaps(320, 240, 10), (320, 240))
-    slam = Slam(Config(semantics="none"), parts, (320, 240))
-    slam.step(Frame(0, 0.0, np.dstack([ref] * 3)))
+    parts = parts_of(GeometricPointmaps(320, 240, 10), Config())
+    slam = Slam(Config(semantics="none"), (320, 240), parts=parts)
+    slam.track(Frame(0, 0.0, np.dstack([ref] * 3)))
     keyframe = slam.graph.keyframes[0]
     still = Future.done(np.zeros((240, 320), np.float32))
     matched = {}
     for name, flow in (("none", None), ("true", np.float32([-80, 8])), ("wrong", np.float32([60, -60]))):
         start = None if flow is None else np.tile(flow, (240, 320, 1))
         parts.features = Given(start)  # type: ignore[assignment]
-        work = parts.observe(Frame(1, 0.1, np.dstack([new] * 3)))
+        work = parts.provider.observe(Frame(1, 0.1, np.dstack([new] * 3)))
         nothing = np.zeros((240, 320, 2), np.float32)  # where a slow camera would be
-        matched[name] = slam.comparer.compare(keyframe, work, still, nothing, np.eye(4)).matched
+        matched[name] = slam.two_view.estimate(keyframe, work, still, nothing, np.eye(4)).matched
     assert parts.features.asked == 1  # type: ignore[attr-defined]
     assert matched["none"] == matched["wrong"] < 0.3 * matched["true"]
-    work = parts.observe(Frame(1, 0.1, np.dstack([ref] * 3)))
-    slam.comparer.compare(keyframe, work, still, nothing, np.eye(4))
+    work = parts.provider.observe(Frame(1, 0.1, np.dstack([ref] * 3)))
+    slam.two_view.estimate(keyframe, work, still, nothing, np.eye(4))
     assert parts.features.asked == 1  # type: ignore[attr-defined] # enough matched: nothing else was tried
 
 
@@ -91,15 +90,15 @@ def test_before_a_start_what_passes_in_front_makes_no_keyframe() -> None:
     """A still camera, and a third of the picture 12 px aside: nobody knows yet that it moves by itself."""
     ref, shifted, _ = pair_of(np.eye(2), np.array([12.0, 0.0]))
     new = np.where(np.arange(320) > 215, shifted, ref)
-    parts = Parts(GeometricPointmaps(320, 240, 10), (320, 240))
-    slam = Slam(Config(semantics="none"), parts, (320, 240))
-    slam.step(Frame(0, 0.0, np.dstack([ref] * 3)))
-    keyframe, work = slam.graph.keyframes[0], parts.observe(Frame(1, 0.1, np.dstack([new] * 3)))
+    parts = parts_of(GeometricPointmaps(320, 240, 10), Config())
+    slam = Slam(Config(semantics="none"), (320, 240), parts=parts)
+    slam.track(Frame(0, 0.0, np.dstack([ref] * 3)))
+    keyframe, work = slam.graph.keyframes[0], parts.provider.observe(Frame(1, 0.1, np.dstack([new] * 3)))
     still, nothing = Future.done(np.zeros((240, 320), np.float32)), np.zeros((240, 320, 2), np.float32)
     motion = []
     for started in (set(), {0}):
         slam.graph.started = started
-        motion.append(slam.comparer.compare(keyframe, work, still, nothing, np.eye(4)).motion_ratio)
+        motion.append(slam.two_view.estimate(keyframe, work, still, nothing, np.eye(4)).motion_ratio)
     assert motion[0] < 0.1 * slam.config.tracking.first_motion_ratio
     assert motion[1] == pytest.approx(12 / np.sqrt(320 * 240), rel=0.05)
 

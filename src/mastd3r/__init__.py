@@ -1,3 +1,64 @@
-"""mastd3r-slam: trajectory, static map and clean splat from any video of a moving world."""
+"""Any video with moving things in it: the camera's trajectory, a dense static map and a clean Gaussian splat.
+
+    import mastd3r
+    rec = mastd3r.reconstruct("my.mp4")             # a Reconstruction: everything, in memory and on disk
+    slam = mastd3r.Slam(mastd3r.Config(), size=(640, 480))
+    result = slam.track(image, timestamp_s)         # (h, w, 3) uint8 RGB, seconds
+    rec = slam.finish()
+
+Names are loaded when they are first used, so that importing the package costs nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .config import Config
+    from .errors import ConfigError, InputError, MissingPackage, OutputError, SlamError
+    from .offline.reconstruction import Reconstruction
+    from .pipeline import load, reconstruct
+    from .slam import Slam, TrackResult
+    from .tracking.state import Status
 
 __version__ = "0.1.0"
+__all__ = [
+    "Config",
+    "ConfigError",
+    "InputError",
+    "MissingPackage",
+    "OutputError",
+    "Reconstruction",
+    "Slam",
+    "SlamError",
+    "Status",
+    "TrackResult",
+    "__version__",
+    "load",
+    "reconstruct",
+]
+_HOME = {
+    "Config": "config",
+    "ConfigError": "errors",
+    "InputError": "errors",
+    "MissingPackage": "errors",
+    "OutputError": "errors",
+    "Reconstruction": "offline.reconstruction",
+    "Slam": "slam",
+    "SlamError": "errors",
+    "Status": "tracking.state",
+    "TrackResult": "slam",
+    "load": "pipeline",
+    "reconstruct": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

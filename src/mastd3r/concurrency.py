@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -29,6 +30,20 @@ class Future(Generic[T]):
         """One that is there."""
         return Future(lambda: value)
 
+    @staticmethod
+    def lazy(make: Callable[[], T]) -> Future[T]:
+        """One that is made, once, in the thread that asks for it first."""
+        made: list[T] = []
+        one_at_a_time = threading.Lock()
+
+        def get() -> T:
+            with one_at_a_time:
+                if not made:
+                    made.append(make())
+                return made[0]
+
+        return Future(get)
+
 
 class Worker:
     """One thread beside the caller's: what is given to it is done in order."""
@@ -40,12 +55,15 @@ class Worker:
         """The value of ``make``, made there."""
         return Future(self._pool.submit(make).result)
 
+    def close(self) -> None:
+        """Wait for all that was given to it, and end it."""
+        self._pool.shutdown()
+
     def __enter__(self) -> Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Waits for all that was given to it."""
-        self._pool.shutdown()
+        self.close()
 
 
 def prefetch(items: Iterator[T], work: Callable[[T, C], None], context: Callable[[], C]) -> Iterator[T]:
@@ -69,6 +87,29 @@ def prefetch(items: Iterator[T], work: Callable[[T, C], None], context: Callable
             yield item  # type: ignore[misc]
 
 
+class _BlasLimit:
+    """Holds BLAS to one thread while anybody is inside, in whichever order they come and go."""
+
+    def __init__(self) -> None:
+        self._lock, self._inside = threading.Lock(), 0
+        self._limits: Any = None
+
+    def enter(self) -> None:
+        with self._lock:
+            self._inside += 1
+            if self._inside == 1:
+                self._limits = threadpool_limits(limits=1, user_api="blas")
+
+    def leave(self) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._limits.restore_original_limits()
+
+
+_BLAS = _BlasLimit()
+
+
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Within it BLAS computes in the thread that calls it, whatever library brought it.
@@ -76,8 +117,11 @@ def one_blas_thread() -> Iterator[None]:
     Our products are small and many: BLAS's own threads would spin between them on the cores that our threads need,
     which costs more than half of the processor's time on two cores.
     """
-    with threadpool_limits(limits=1, user_api="blas"):
+    _BLAS.enter()
+    try:
         yield
+    finally:
+        _BLAS.leave()
 
 
 S = TypeVar("S")

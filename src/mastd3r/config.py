@@ -136,6 +136,8 @@ class Config:
     pointmaps: PointmapKind = "auto"
     semantics: SemanticsKind = "auto"
     correction: CorrectionKind = "coarse-to-fine"
+    features: str = "orb"
+    places: str = "auto"
     seed: int = 0
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)

@@ -101,7 +101,7 @@ MAP_BACKENDS = Registry("map backend", "mapping.backend", auto=True)
 REGISTRIES = (POINTMAPS, FEATURES, ALIGNMENT, DYNAMICS, SEMANTICS, PLACES, MAP_BACKENDS)
 
 POINTMAPS.register("geometric", "pointmap.geometric:build_geometric", "flow, triangulation, the lens from the video")
-POINTMAPS.register("mast3r", "pointmap.mast3r:build_mast3r", "MASt3R, see `mastd3r weights`")
+POINTMAPS.register("mast3r", "parts:build_mast3r", "MASt3R, see `mastd3r weights`")
 POINTMAPS.register("depth", "pointmap.geometric:build_sensor_depth", "sensor depth of the sequence")
 
 FEATURES.register("orb", "features.orb:build", "ORB corners and a homography")
@@ -111,15 +111,13 @@ ALIGNMENT.register("coarse", "alignment.align:build_coarse", "eq. (8)-(10)")
 ALIGNMENT.register("fine", "alignment.align:build_fine", "eq. (11)(12)")
 ALIGNMENT.register("coarse-to-fine", "alignment.align:build_coarse_to_fine", "eq. (8)-(12)")
 
-DYNAMICS.register(
-    "ours", "dynamics.filter:build_ours", "log-odds filter over motion, depth, semantics, time, appearance"
-)
-DYNAMICS.register("paper", "dynamics.paper:build_paper", "eq. (1)-(4) as printed")
-DYNAMICS.register("none", "dynamics.paper:build_none", "nothing moves")
+DYNAMICS.register("ours", "dynamics.shim:build", "log-odds filter over motion, depth, semantics, time, appearance")
+DYNAMICS.register("paper", "dynamics.shim:build", "eq. (1)-(4) as printed")
+DYNAMICS.register("none", "dynamics.shim:build", "nothing moves")
 
-SEMANTICS.register("none", "semantics:build_none", "no prior")
-SEMANTICS.register("dinov2", "semantics:build_dinov2", "DINOv2 foreground, see `mastd3r weights`")
-SEMANTICS.register("maps", "semantics:build_maps", "P(movable) maps beside the frames")
+SEMANTICS.register("none", "sources.semantic_maps:build_none", "no prior")
+SEMANTICS.register("dinov2", "parts:build_dinov2", "DINOv2 foreground, see `mastd3r weights`")
+SEMANTICS.register("maps", "sources.semantic_maps:build_maps", "P(movable) maps beside the frames")
 
 PLACES.register("thumbnail", "graph.place_recognition:build_thumbnail", "small blurred pictures")
 PLACES.register("pointmaps", "graph.place_recognition:build_of_provider", "tokens of the pointmap network")

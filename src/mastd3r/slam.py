@@ -1,361 +1,246 @@
-"""The main loop: one frame in, one report out."""
+"""The paper's loop: ``track`` is one frame, ``finish`` what follows the last; a line a stage, its file beside it."""
 
 from __future__ import annotations
 
-import logging
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .concurrency import Future, Worker
+from .camera.rectification import Rectifier, rectifier_for
+from .concurrency import Future, one_blas_thread
 from .config import Config
-from .dynamics.filter import LogOddsFilter
-from .dynamics.soft_mask import grown, static_at
+from .errors import InputError
+from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
-from .graph.covisibility import nearest_keyframe
-from .graph.initialisation import bootstrap
-from .graph.intrinsics import Intrinsics, intrinsics_for
-from .graph.keyframe_graph import Keyframe, KeyframeGraph
-from .graph.prediction import rigid_flow_to
-from .graph.submaps import join, scale_between
-from .parts import Near, Parts
-from .pointmap.flow_maps import invert_flow
-from .pointmap.mast3r import NetworkFrame
-from .sources.checks import frame_is_blank
-from .tracking.covisibility import CovisibilityEdges
-from .tracking.depth_prior import own_depth_prior, predicted_depth
-from .tracking.loop_closure import close_loops, widen
-from .tracking.mask_input import dynamics_input
-from .tracking.two_view import THIN, TwoView, TwoViewEstimator, matched_share
-from .types import Frame, State, WorkFrame
+from .graph.intrinsics import intrinsics_for
+from .graph.keyframe_graph import KeyframeGraph
+from .offline.job import RunJob, Tracked
+from .offline.reconstruction import Reconstruction
+from .parts import Parts, build_parts, chosen_map_device
+from .progress import Reporter, Silent
+from .sources.recorded import RecordedSource
+from .sources.rectified import RectifiedSource, rectified
+from .tracking.keyframes import Keyframes
+from .tracking.loop_closure import add_covisible_pairs, close_loops
+from .tracking.masking import MaskTracker
+from .tracking.observation import Near, Observer
+from .tracking.recovery import Recovery
+from .tracking.state import Status, TrackingState
+from .tracking.two_view import TwoViewEstimator
+from .types import Frame, Source
 
 Array = NDArray[Any]
-log = logging.getLogger(__name__)
-EDGES_AFTER = 4  # frames after a keyframe until its ties are taken: at the same frame however fast they were made
-LEAST_MOTION_RATIO = 0.04  # of sqrt(width * height): from the same place a nearer keyframe sees no more of the scene
-FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 
 
 @dataclass(frozen=True)
-class StepReport:
-    """What happened to one frame."""
+class TrackResult:
+    """What is known of one frame when it has been tracked; later frames may still correct it."""
 
-    index: int
+    index: int  # of the frame, from 0
     timestamp_s: float
-    state: State
-    kf_id: int
+    state: Status
+    world_from_cam: Array | None  # (4, 4), OpenCV axes, map units; None where the frame has no place in the map yet
     is_keyframe: bool
-    why: str
+    reason: str  # why the camera is lost or starts anew; empty while all goes well
+    keyframe_id: int  # the keyframe that the frame hangs on
+    _moving: Future[Array]
+    _as_given: Callable[[Array], Array]
 
-
-def started_at(lens: Intrinsics, work: WorkFrame, size: tuple[int, int]) -> Intrinsics:
-    """The lens with the focal length that the frame's own points speak of, where they do and a camera may have it."""
-    focal_px = work.focal_px if isinstance(work, NetworkFrame) else None
-    low, high = FOCAL_RATIOS_BELIEVED
-    if focal_px is None or not low < focal_px / np.sqrt(size[0] * size[1]) < high:
-        return lens
-    g = np.concatenate([[np.log(focal_px)], lens.values[1:]])
-    return Intrinsics(g, g.copy(), lens.prior_info)
+    @cached_property
+    def moving(self) -> Array:
+        """(h, w) float32 P(moving) over the image as it was given, with a margin; waits until it is made."""
+        return self._as_given(self._moving.get())
 
 
 class Slam:
-    """Tracking and mapping of one source. Each line of ``step`` is one stage of the paper."""
+    """Tracking and mapping of one camera. Instances do not know of one another."""
 
-    def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
-        self.config, self.parts = config, parts
-        width, height = parts.size
-        self.graph = KeyframeGraph(config.graph, intrinsics_for(config.camera, width, height, full_size))
-        self.graph.size = parts.size  # a run without a single keyframe still has a lens
-        self.belief = LogOddsFilter(config.dynamics, width, height)
-        self.comparer = TwoViewEstimator(config, parts, self.graph)
-        self._mask = Worker("mask")  # the belief lives in its thread: it is updated while the next frame is matched
-        self.links = CovisibilityEdges(config.graph, parts)
-        self._tying = Worker("ties")
-        self._tied: Future[KeyframeGraph] | None = None  # the graph with the newest keyframe's ties, not yet taken
-        self._ref: Keyframe | None = None  # the keyframe that frames are tracked against
-        self._before_loss: Keyframe | None = None  # the same, when the camera was lost
-        self._flow: Array | None = None  # ref -> last frame
-        self._last: tuple[WorkFrame, Future[Array]] | None = None  # last tracked frame and its P(moving)
-        self._cam_from_ref = np.eye(4)  # of the last tracked frame
-        self._most_matched = 0  # by any frame since ref was chosen
-        self._keyframe_at = 0  # records there were when the newest keyframe was tied
+    def __init__(
+        self,
+        config: Config | None = None,
+        size: tuple[int, int] = (640, 480),
+        *,
+        source: Source | None = None,
+        parts: Parts | None = None,
+    ) -> None:
+        """``size`` (width, height) of the images. ``source``: what the frames come from, if it can be read again.
 
-    def near(self) -> Near:
-        """What the frame after the next is probably seen beside: the keyframe that is followed now."""
-        ref = self._ref
-        return lambda _: None if ref is None else ref.work
+        Without one, frames are kept on disk until ``finish``. ``parts``: instead of those that the options name.
+        Raises ConfigError and InputError for options that this machine or source cannot serve.
+        """
+        self.config = config or Config()
+        given = self.config.camera.intrinsics
+        self.recorded = None if source is not None else _recorded(self.config, size)
+        self.source: Source = source if source is not None else self.recorded  # type: ignore[assignment]
+        self.rectifier = rectifier_for(given, self.source.size)
+        seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
+        self.parts = parts if parts is not None else build_parts(self.config, seen)
+        self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen.size)
+        self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
+        self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)
+        self.recovery = Recovery(self.parts, self.graph, self.two_view, self.keyframes)
+        self.masks = MaskTracker(self.parts.dynamics.filter(*self.parts.provider.size), self.graph)
+        self.observer = Observer(self.parts)
+        self.aligner = self.parts.aligner
+        self.state = TrackingState()
+        self._ended, self._tracked, self._tracking_s = False, 0, 0.0
 
-    def step(self, frame: Frame) -> StepReport:
-        """Track one frame (III-A, III-B); keyframes extend the graph."""
-        if len(self.graph.records) - self._keyframe_at >= EDGES_AFTER:
-            self._settle()
-        work = self.parts.observe(frame, None if self._ref is None else self._ref.work)
-        if frame_is_blank(frame.image):
-            return self._lost(work, "the image is blank")
-        looks = self._mask.submit(lambda: self.parts.describe(frame) if self.config.dynamics.use_head else None)
-        prior = self._mask.submit(
-            lambda: grown(self.belief.prior(work.gray, work.semantic, looks.get()))
-        )  # prior of (2)
-        if self._ref is None:
-            return self._start(work, prior, "first view")
-        view = self._find(work, prior)  # may change what is followed
-        kf = self._ref
-        if view is None:
-            kf, view = self._retry(work, prior)
-        if view is None:
-            return self._start_again(work, prior)
-        moving = self._update_belief(work, kf, view, prior, looks)  # III-A, (2)(3)
-        self.graph.record(work, kf.id, view.alignment.new_from_ref, "tracked", view.pair.matches, view.weight)
-        self._follow(kf, view, self._most_matched if kf is self._ref else 0)
-        self._last = (work, moving)
-        if self._wants_keyframe(view) and not self._changes_to_known(work, moving):
-            kf = self._add_keyframe(work, moving, view)  # graph, joint optimisation
-        return StepReport(work.index, work.timestamp_s, "tracked", kf.id, self._flow is None, "")
+    def track(
+        self,
+        image: Array | Frame,
+        timestamp_s: float = np.nan,
+        *,
+        depth_m: Array | None = None,
+        semantic: Array | None = None,
+    ) -> TrackResult:
+        """Track one frame: III-A and III-B.
 
-    def _find(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
-        """The frame against the keyframe that is followed; a young submap first looks for the map that was lost."""
-        assert self._ref is not None
-        if not self.graph.initialised and self.graph.started:
-            view = self._rejoin(work, prior)
-            if view is not None:
-                return view
-        view = self.comparer.compare(self._ref, work, prior, self._flow, self._cam_from_ref)
-        if not self.comparer.accepted(view):
-            return None
-        thin = matched_share(self._ref, view.weight) < THIN
-        return self._from_nearer(work, prior, view) if thin else view
+        image (h, w, 3) uint8 RGB of the size that was said, timestamp_s ascending seconds; depth_m (h, w) metres where
+        ``pointmaps=depth``, semantic (h', w') P(movable) where ``semantics=maps``. A ``Frame`` of the source carries
+        all of it. Raises InputError, before anything has changed, for another size or type, a time that is not finite
+        or does not rise, and after ``finish``.
+        """
+        frame = self._frame(image, timestamp_s, depth_m, semantic)
+        with self._timed(), one_blas_thread():
+            state = self.keyframes.up_to_date(self.state)
+            seen = self.observer.observe(frame, None if state.anchor is None else state.anchor.work)  # (III-A)
+            prior = self.masks.prior(seen)  # prior of (2): dynamics/filter.py
+            problem = self.two_view.match(state, seen, prior)  # (5)(6)(7): tracking/two_view.py
+            coarse = self.aligner.coarse(problem)  # (8): alignment/coarse.py
+            scaled = self.aligner.scale(problem, coarse)  # (9)(10): alignment/scale.py
+            fine = self.aligner.fine(problem, scaled)  # (11)(12): alignment/fine.py
+            view = self.two_view.view(state.anchor, problem, fine)
+            state, view = self.recovery.accept(state, seen, prior, view)  # as it is, while all goes well
+            moving = self.masks.update(seen, view, prior)  # (1)-(4): dynamics/filter.py, dynamics/paper.py
+            state = self.keyframes.record(state, seen, view, moving)
+            self.state = self.keyframes.extend(state, view)  # graph/keyframe_graph.py
+        return self._result(frame, moving)
 
-    def _from_nearer(self, work: WorkFrame, prior: Future[Array], view: TwoView) -> TwoView:
-        """Few matches are left: the last good frame becomes a keyframe, so that the chain has no weak link."""
-        before, most = self._ref, self._most_matched
-        assert before is not None
-        if not self.graph.initialised or view.motion_ratio < LEAST_MOTION_RATIO:
-            return view
-        near = self._from_last(work, prior)
-        if near is not None and near.weight.sum() > view.weight.sum():
-            return near
-        self._follow(before, view, most)
-        return view
+    @one_blas_thread()
+    def finish(self, job: RunJob | None = None) -> Reconstruction:
+        """Everything after the last frame, as ``config`` says; gives what came of it, in memory and on disk.
 
-    def _from_last(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
-        """The last good frame becomes a keyframe, which is followed from here on; the frame seen from it, if it is."""
-        last = self._last
-        if last is None or self._flow is None or self.graph.records[-1].state != "tracked":
-            return None
-        near = self.comparer.compare(self._promote_last(*last), work, prior, None, np.eye(4))
-        return near if self.comparer.accepted(near) else None
+        ``job``: where it is written; by default a temporary folder, which lives as long as the result.
+        Raises InputError where the frames had too little in them, and after an earlier ``finish``.
+        """
+        self._refuse_if_ended("finish")
+        if job is None:
+            return self._finish_alone()
+        with job.timed("tracking"):
+            self.end_tracking()
+        job.check_tracked()
+        job.solve()  # joint optimisation: graph/bundle_adjustment.py; every frame's pose: offline/final_solve.py
+        material = job.smooth_masks(self.masks.filter.appearance)  # III-A, both ways: dynamics/smoother.py;
+        # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
+        job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
+        job.report()
+        return Reconstruction(job.folder.path)
 
-    def _rejoin(self, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
-        """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
+    def end_tracking(self) -> None:
+        """After the last frame: submaps joined, loops closed, and what sees the same matched across time."""
+        self._refuse_if_ended("finish")
+        self._ended = True
         graph = self.graph
-        ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
-        candidates = self.parts.places.best(graph, work, ids)
-        if self._before_loss is not None:
-            candidates = [self._before_loss, *(kf for kf in candidates if kf.id != self._before_loss.id)]
-        for kf in candidates:
-            view = self.comparer.relocalised(kf, work, prior)
-            if view is not None:
-                log.info("frame %d found again from keyframe %d", work.index, kf.id)
-                graph.drop_submap()
-                graph.submap = graph.submap_of[kf.id]
-                self.links.flows.clear()
-                self._follow(kf, view, 0)
-                return view
-        return None
-
-    def _retry(self, work: WorkFrame, prior: Future[Array]) -> tuple[Keyframe, TwoView | None]:
-        """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
-        near, graph = self._from_last(work, prior), self.graph
-        assert self._ref is not None
-        if near is not None:
-            return self._ref, near
-        places = self.parts.places.best(graph, work, graph.members())
-        for kf in [self._ref, *(p for p in places if p.id != self._ref.id)]:
-            view = self.comparer.relocalised(kf, work, prior)
-            if view is not None:
-                log.info("frame %d found again from keyframe %d", work.index, kf.id)
-                return kf, view
-        return self._ref, None
-
-    def _follow(self, kf: Keyframe, view: TwoView, most_matched: int) -> None:
-        self._ref, self._most_matched = kf, most_matched
-        self._flow, self._cam_from_ref = view.pair.flow, view.alignment.new_from_ref
-
-    def close(self) -> None:
-        """After the last frame: keep what it alone sees, and join the submaps that can be."""
-        self._settle()
-        graph = self.graph
-        if self._last is not None:
-            self._last[1].get()
-        if self._last is not None and self._flow is not None and self._ref is not None:
-            work, moving = self._last
-            view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
-            t = self.config.tracking
-            enough = 0.3 * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
-            if self.comparer.accepted(view) and view.motion_ratio > enough:
-                self._add_keyframe(work, moving, view)
-        if graph.started and graph.keyframes and not graph.initialised and not bootstrap(graph):
-            graph.drop_submap()
-            graph.submap = graph.submap_of[graph.latest.id]
-        for submap in sorted(graph.started)[1:]:
-            graph.submap = submap
-            any(self._joins(graph.keyframes[k]) for k in graph.members())
+        self.keyframes.finish(self.state)
         for submap in sorted(graph.started):
             graph.submap = submap
-            close_loops(self.comparer, graph, self.parts.places)
-            widen(graph, lambda pairs: self.links.many(graph, pairs))
+            close_loops(self.two_view, graph, self.parts.places)
+            add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
+        self.masks.close()
+        self.keyframes.close()
 
-    # -- keyframes -------------------------------------------------------------------------------------------
+    def prefetched(self, photographs: Iterator[Frame]) -> Iterator[Frame]:
+        """Frames for ``track``, each read, and looked at, while the one before is tracked."""
+        rectifier = self.rectifier
+        frames = photographs if rectifier is None else (rectified(p, rectifier) for p in photographs)
+        return self.observer.prefetched(frames, self._near)
 
-    def _start(self, work: WorkFrame, prior: Future[Array], why: str) -> StepReport:
-        graph = self.graph
-        if not graph.started and not self.config.camera.intrinsics:
-            graph.intrinsics = started_at(graph.intrinsics, work, graph.size)
-        sigma = self.parts.provider.depth_sigma_ratio
-        inv_depth, info = own_depth_prior(work, 1.0, sigma)
-        kf = graph.add_keyframe(work, static_at(prior.get(), work.px), prior.get(), np.eye(4), inv_depth, info)
-        graph.record(work, kf.id, np.eye(4), "started", None, np.zeros(0))
-        graph.replace_last_by_keyframe(kf)
-        if sigma is not None and bool((info * inv_depth**2 > 1).mean() > 0.1):
-            graph.started.add(graph.submap)
-        self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
-        self._last = (work, prior)
-        return StepReport(work.index, work.timestamp_s, "started", kf.id, True, why)
+    def job(self, folder: RunFolder, reporter: Reporter | None = None) -> RunJob:
+        """What writes this run into a folder."""
+        device = chosen_map_device(self.config.mapping, self.parts.notes)
+        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, device)
+        return RunJob(tracked, folder, reporter or Silent())
 
-    def _start_again(self, work: WorkFrame, prior: Future[Array]) -> StepReport:
-        """The camera is lost: what follows is a submap of its own until it is recognised."""
-        self._settle()
-        graph, ref = self.graph, self._ref
-        why = "the view before it cannot be followed into it, and no keyframe looks like it"
-        log.info("frame %d lost: %s", work.index, why)
-        if graph.initialised:
-            self._before_loss = ref
-        else:
-            graph.drop_submap()
-        self.links.flows.clear()
-        graph.start_submap()
-        return self._start(work, prior, why)
+    def _finish_alone(self) -> Reconstruction:
+        """``finish`` in a temporary folder."""
+        folder = tempfile.TemporaryDirectory(prefix="mastd3r-run-", ignore_cleanup_errors=True)
+        job = self.job(RunFolder(Path(folder.name)))
+        job.frames, job.timings["tracking"] = self._tracked, self._tracking_s
+        with job:
+            self.finish(job)
+        return Reconstruction(job.folder.path, folder)
 
-    def _wants_keyframe(self, view: TwoView) -> bool:
-        t = self.config.tracking
-        self._most_matched = max(self._most_matched, view.matched)
-        thin = view.matched < t.keyframe_overlap_ratio * self._most_matched
-        enough = t.keyframe_motion_ratio if self.graph.initialised else t.first_motion_ratio
-        # something that passes in front thins the matches too, but from the same place nothing is gained
-        return view.motion_ratio > enough or (thin and view.motion_ratio > 0.4 * enough)
+    @contextmanager
+    def _timed(self) -> Iterator[None]:
+        began = time.perf_counter()
+        yield
+        self._tracked, self._tracking_s = self._tracked + 1, self._tracking_s + time.perf_counter() - began
 
-    def _changes_to_known(self, work: WorkFrame, moving: Future[Array]) -> bool:
-        """Where an older keyframe sees the same from nearby, frames hang on that one, and nothing is added."""
-        graph, ref, t = self.graph, self._ref, self.config.tracking
-        assert ref is not None
-        if not graph.initialised:
-            return False
-        cam_from_world = self._cam_from_ref @ graph.variables[ref.id].cam_from_world
-        near = nearest_keyframe(graph, cam_from_world, ref.id, t.known_overlap_ratio, t.known_motion_ratio)
-        if near is None:
-            return False
-        kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.variables[near].cam_from_world)
-        view = self.comparer.compare(kf, work, moving, rigid_flow_to(graph, near, cam_from_world), guess)
-        alike = view.motion_ratio <= t.keyframe_motion_ratio and matched_share(kf, view.weight) >= 0.4
-        if not self.comparer.accepted(view) or not alike:
-            return False
-        if abs(near - ref.id) > 1 and not graph.connected(near, ref.id):
-            self._settle()
-            if self.links.both(graph, near, ref.id):
-                log.info("keyframes %d and %d see the same place", near, ref.id)
-                graph.solve_all(4, 1.0)
-        self._follow(kf, view, view.matched)
-        return True
+    def _near(self) -> Near:
+        """What the frame after the next is probably seen beside: the keyframe that is followed now."""
+        anchor = self.state.anchor
+        return lambda _: None if anchor is None else anchor.work
 
-    def _promote_last(self, work: WorkFrame, moving: Future[Array]) -> Keyframe:
-        assert self._ref is not None
-        prior_view = self.comparer.compare(self._ref, work, moving, self._flow, self._cam_from_ref)
-        return self._add_keyframe(work, moving, prior_view)
+    def _frame(self, image: Array | Frame, timestamp_s: float, depth_m: Array | None, semantic: Array | None) -> Frame:
+        self._refuse_if_ended("track")
+        if isinstance(image, Frame):
+            return image
+        if self.recorded is None:
+            raise InputError("track: expected frames of the source that was given, got an image")
+        photograph = self.recorded.frame(image, timestamp_s, depth_m, semantic)
+        return photograph if self.rectifier is None else rectified(photograph, self.rectifier)
 
-    def _add_keyframe(self, work: WorkFrame, moving: Future[Array], view: TwoView) -> Keyframe:
-        """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
-        self._settle()
-        graph, before = self.graph, self._ref
-        assert before is not None
-        cam_from_world = view.alignment.new_from_ref @ graph.variables[before.id].cam_from_world
-        sigma = self.parts.provider.depth_sigma_ratio
-        inv_depth, info = predicted_depth(graph, before.id, cam_from_world, work, view.alignment.scale, sigma)
-        mask = moving.get()
-        kf = graph.add_keyframe(work, static_at(mask, work.px), mask, cam_from_world, inv_depth, info)
-        graph.replace_last_by_keyframe(kf)
-        graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
-        if not graph.initialised:
-            self.links.flows[before.id, kf.id] = view.pair.flow
-        self.links.one(graph, kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
-        self._ref, self._flow, self._cam_from_ref, self._most_matched = kf, None, np.eye(4), 0
-        self._last = (work, moving)
-        if graph.initialised:
-            self._tie(kf, before.id)
-            return kf
-        self.links.to_recent(graph, kf, before.id)
-        if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
-            self.links.flows.clear()
-        return kf
+    def _refuse_if_ended(self, what: str) -> None:
+        if self._ended:
+            raise InputError(f"{what}: expected a run that goes on, got one that has been finished; make a new Slam")
 
-    def _tie(self, kf: Keyframe, before: int) -> None:
-        """Tie a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
-        graph = self.graph
-        everything = len(graph.members()) in (10, 16, 24, 40, 64, 100, 160, 256)
-        hurry = len(graph.records) - self._keyframe_at < EDGES_AFTER  # the next may come before they are made
-        self._keyframe_at = len(graph.records)
-        alone = graph.window_is_all or everything or hurry or len(graph.started) > 1
-        if self.parts.provider.side_by_side and not alone:
-            graph.solve_depths(kf.id)
-            aside = graph.aside()
-            self._tied = self._tying.submit(lambda: self.links.tie(aside, kf, before))
-            return
-        self.links.tie(graph, kf, before)
-        if not (len(graph.started) > 1 and self._joins(kf)) and everything:
-            graph.solve_all(6, 1.0)
+    def _result(self, frame: Frame, moving: Future[Array]) -> TrackResult:
+        """What the caller is told; the pose is the map's as it is now."""
+        state, record = self.state, self.graph.records[-1]
+        placed = state.status is Status.TRACKING
+        cam_from_world = record.cam_from_kf @ self.graph.variables[record.kf_id].cam_from_world if placed else None
+        width, height = self.source.size
 
-    def _settle(self) -> None:
-        """Wait for the ties of the newest keyframe, and take them into the graph."""
-        if self._tied is not None:
-            tied, self._tied = self._tied, None
-            self.graph.take(tied.get())
+        def as_given(values: Array) -> Array:
+            over = values if self.rectifier is None else self.rectifier.as_photograph(values)
+            return np.asarray(cv2.resize(over, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
 
-    def _joins(self, kf: Keyframe) -> bool:
-        """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
-        graph = self.graph
-        own = graph.submap_of[kf.id]
-        others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
-        for other in self.parts.places.best(graph, kf.work, others):
-            view = self.comparer.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
-            if view is None:
-                continue
-            pose = view.alignment.new_from_ref
-            scale = scale_between(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
-            if scale is None:
-                continue
-            log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
-            join(graph, other.id, kf.id, pose, scale)
-            for k in range(max(0, other.id - 2), min(len(graph.keyframes), other.id + 3)):
-                if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:
-                    self.links.both(graph, k, kf.id)
-            graph.solve_all(10, 2.0)
-            return True
-        return False
+        return TrackResult(
+            frame.index,
+            frame.timestamp_s,
+            state.status,
+            None if cam_from_world is None else inverse(cam_from_world),
+            record.is_keyframe,
+            state.reason,
+            record.kf_id,
+            moving,
+            as_given,
+        )
 
-    def _update_belief(
-        self, work: WorkFrame, kf: Keyframe, view: TwoView, prior: Future[Array], looks: Future[Array | None]
-    ) -> Future[Array]:
-        if not self.graph.initialised:
-            return prior
-        cam_from_world = view.alignment.new_from_ref @ self.graph.variables[kf.id].cam_from_world
-        given = dynamics_input(self.graph, kf.id, inverse(cam_from_world), work, view.alignment.scale)
-        return self._mask.submit(lambda: grown(self.belief.update(replace(given, features=looks.get())).probability))
 
-    def _lost(self, work: WorkFrame, why: str) -> StepReport:
-        """Nothing can be seen: the frame has no place, and the next one is looked for where the last one was."""
-        ref = self._ref.id if self._ref is not None else 0
-        self.graph.record(work, ref, self._cam_from_ref, "lost", None, np.zeros(0))
-        self._flow, self._last = None, None
-        log.warning("frame %d lost: %s", work.index, why)
-        return StepReport(work.index, work.timestamp_s, "lost", ref, False, why)
+def _recorded(config: Config, size: tuple[int, int]) -> RecordedSource:
+    if len(size) != 2 or min(size) < 1:
+        raise InputError(f"size: expected (width, height) of the images in pixels, got {size}")
+    depth, maps = config.pointmaps == "depth", config.semantics == "maps"
+    return RecordedSource((int(size[0]), int(size[1])), has_depth=depth, has_semantic=maps)
+
+
+def _empty_graph(config: Config, parts: Parts, rectifier: Rectifier | None, size: tuple[int, int]) -> KeyframeGraph:
+    """A graph without keyframes, with a lens; where photographs are rectified that is the pinhole."""
+    camera = config.camera
+    if rectifier is not None:
+        c = rectifier.pinhole
+        camera = replace(camera, intrinsics=(c.fx_px, c.fy_px, c.cx_px, c.cy_px))
+    width, height = parts.provider.size
+    graph = KeyframeGraph(config.graph, intrinsics_for(camera, width, height, size))
+    graph.size = parts.provider.size
+    return graph

@@ -29,6 +29,12 @@ class Frame:
     image: Array  # (h, w, 3) uint8 RGB, full resolution
     depth_m: Array | None = None  # (h, w) float32 metres, 0 = none; only sources with a depth sensor
     semantic: Array | None = None  # (h', w') float32 P(movable thing) in 0..1, any resolution
+    photograph: Frame | None = None  # what the camera took, where ``image`` is a pinhole image made of it
+
+    @property
+    def as_taken(self) -> Frame:
+        """The photograph itself."""
+        return self if self.photograph is None else self.photograph
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class WorkFrame:
     texture: Array  # (p,) float64 0..1, how well the pixel can be matched
     semantic: Array | None  # (h, w) float32 P(movable)
     own_inv_depth: Array | None  # (h, w) float32 measured in this frame alone, 0 = none; None: no such measurement
+    focal_px: float | None = None  # the lens that the frame's own points speak of, at working size
 
 
 @dataclass(frozen=True)
@@ -105,11 +112,10 @@ class Guess:
 
 @dataclass(frozen=True)
 class PairPrediction:
-    """Two views seen together: both pointmaps in ref's camera, and the matches between them."""
+    """Two views seen together: ref's pointmap, the matches between them, and new's points where they are measured."""
 
     matches: Matches
     ref: Pointmap  # in ref's camera, at matches.ref_px
-    new: Pointmap  # in ref's camera, at matches.new_px
     new_own: Pointmap | None  # new's points in NEW's camera, where the provider measures depth in a frame alone
     flow: Array  # (h, w, 2) float32 ref -> new
 
@@ -136,17 +142,6 @@ class StaticCloud:
     confidence: Array  # (n,) float32
     spacing: Array  # (n,) float32, size in map units of the patch that a point stands for
     kf_id: Array  # (n,) int32
-
-
-@dataclass(frozen=True)
-class FramePose:
-    """Where one frame stands: a pose relative to its keyframe, and how it came by it."""
-
-    index: int
-    timestamp_s: float
-    kf_id: int
-    kf_from_cam: Array  # (4, 4) float64
-    state: State
 
 
 @dataclass(frozen=True)

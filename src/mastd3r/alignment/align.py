@@ -1,17 +1,19 @@
-"""Coarse, scale, fine in order; each can be switched off (Table IV)."""
+"""III-B in three stages, coarse, scale, fine; each can be switched off (Table IV)."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
-from ..config import AlignmentConfig, CorrectionKind
+from ..config import AlignmentConfig
 from ..geometry.sim3 import procrustes
+from ..protocols import Aligner
 from ..types import PairPrediction
 from .coarse import icp, resect
 from .fine import OwnPoints, align_fine
+from .problem import AlignmentProblem
 from .reproject import StaticMatches, solve_pose
 from .result import Alignment
 from .scale import correct_scale
@@ -19,41 +21,96 @@ from .scale import correct_scale
 Array = NDArray[Any]
 
 
-def align(
-    pair: PairPrediction,
-    matches: StaticMatches,
-    guess: Array,
-    correction: CorrectionKind,
-    config: AlignmentConfig,
-    sigma_ratio: float | None,
-) -> Alignment:
-    """Pose of the new view of ``pair`` against its ref (III-B).
+class CoarseToFine:
+    """The paper's aligner. Where the map has no structure yet there is nothing to align with: the guess stays."""
 
-    ``none`` is what the pair says by itself: the closed form over all its matches for a provider that measures
-    depth, the guess brought on to the matches by plain (almost unrobust) least squares otherwise.
-    """
-    if matches.count < config.min_matches:
-        return Alignment.failed(guess, f"too few static matches ({matches.count} < {config.min_matches})")
-    own = _own_points(pair, matches, sigma_ratio)
-    pose, scale, stages = _raw(pair, matches, own, guess), 1.0, ["raw"]
-    converged, iterations = True, 0
-    if correction in ("coarse", "coarse-to-fine"):
-        coarse = resect(matches, pose) if own is None else icp(own.ref, own.new, own.weight, pose)
-        pose, converged, iterations = coarse.new_from_ref, coarse.converged, coarse.iterations
-        stages.append("coarse")
-        if own is not None:
-            scale = _scale_of(own, matches, guess)
-            pose = icp(own.ref, scale * own.new, own.weight, pose).new_from_ref
-            stages.append("scale")
-    information = np.zeros((6, 6))
-    if correction in ("fine", "coarse-to-fine"):
-        printed = config.as_printed and own is not None
-        fine, scale = align_fine(matches, own, pose, scale, chamfer_weight=config.chamfer_weight, as_printed=printed)
-        pose, converged, information = fine.new_from_ref, fine.converged, fine.information
-        iterations += fine.iterations
-        stages.append("fine")
-    inlier_ratio, error_px = matches.quality(pose)
-    return Alignment(pose, scale, converged, iterations, inlier_ratio, error_px, information, tuple(stages))
+    def __init__(self, config: AlignmentConfig, *, use_coarse: bool = True, use_fine: bool = True) -> None:
+        """Without coarse and fine the pose is what the pair says by itself.
+
+        That is the closed form over all its matches for a provider that measures depth, and otherwise the guess
+        brought on to the matches by plain (almost unrobust) least squares.
+        """
+        self.config, self.use_coarse, self.use_fine = config, use_coarse, use_fine
+
+    def coarse(self, problem: AlignmentProblem) -> Alignment:
+        """Eq. (8): ICP of both clouds, or of the static points in the image where new has no cloud of its own."""
+        matches, guess = problem.matches, problem.guess
+        if matches is None:
+            return Alignment(guess, 1.0, True, 0, 1.0, 0.0, ("flow only",))
+        if matches.count < self.config.min_matches:
+            few = f"too few static matches ({matches.count} < {self.config.min_matches})"
+            return Alignment.failed(guess, few)
+        own = _own_points(problem.pair, matches, problem.sigma_ratio)
+        pose = _raw(matches, own, guess)
+        if not self.use_coarse:
+            return Alignment(pose, 1.0, True, 0, 0.0, float("inf"), ("raw",))
+        found = resect(matches, pose) if own is None else icp(own.ref, own.new, own.weight, pose)
+        stages = ("raw", "coarse")
+        return Alignment(found.new_from_ref, 1.0, found.converged, found.iterations, 0.0, float("inf"), stages)
+
+    def scale(self, problem: AlignmentProblem, coarse: Alignment) -> Alignment:
+        """Eq. (9)(10): new's lengths brought to the map's, and the clouds aligned once more."""
+        matches = problem.matches
+        if matches is None or coarse.has_failed or not self.use_coarse:
+            return coarse
+        own = _own_points(problem.pair, matches, problem.sigma_ratio)
+        if own is None:
+            return coarse
+        scale = _scale_of(own, matches, problem.guess)
+        pose = icp(own.ref, scale * own.new, own.weight, coarse.new_from_ref).new_from_ref
+        return replace(coarse, new_from_ref=pose, scale=scale, stages=(*coarse.stages, "scale"))
+
+    def fine(self, problem: AlignmentProblem, scaled: Alignment) -> Alignment:
+        """Eq. (11)(12), and what share of the matches the pose explains in the end."""
+        matches = problem.matches
+        if matches is None or scaled.has_failed:
+            return scaled
+        found = scaled
+        if self.use_fine:
+            own = _own_points(problem.pair, matches, problem.sigma_ratio)
+            fine, scale = align_fine(
+                matches,
+                own,
+                scaled.new_from_ref,
+                scaled.scale,
+                chamfer_weight=self.config.chamfer_weight,
+                as_printed=self.config.as_printed and own is not None,
+            )
+            found = replace(
+                scaled,
+                new_from_ref=fine.new_from_ref,
+                scale=scale,
+                converged=fine.converged,
+                iterations=scaled.iterations + fine.iterations,
+                stages=(*scaled.stages, "fine"),
+            )
+        inlier_ratio, error_px = matches.quality(found.new_from_ref)
+        return replace(found, inlier_ratio=inlier_ratio, error_px=error_px)
+
+
+def align(aligner: Aligner, problem: AlignmentProblem) -> Alignment:
+    """All three stages in order."""
+    return aligner.fine(problem, aligner.scale(problem, aligner.coarse(problem)))
+
+
+def build_none(config: AlignmentConfig) -> CoarseToFine:
+    """What the pair says by itself."""
+    return CoarseToFine(config, use_coarse=False, use_fine=False)
+
+
+def build_coarse(config: AlignmentConfig) -> CoarseToFine:
+    """Eq. (8)-(10) alone."""
+    return CoarseToFine(config, use_fine=False)
+
+
+def build_fine(config: AlignmentConfig) -> CoarseToFine:
+    """Eq. (11)(12) alone."""
+    return CoarseToFine(config, use_coarse=False)
+
+
+def build_coarse_to_fine(config: AlignmentConfig) -> CoarseToFine:
+    """Eq. (8)-(12)."""
+    return CoarseToFine(config)
 
 
 def _own_points(pair: PairPrediction, matches: StaticMatches, sigma_ratio: float | None) -> OwnPoints | None:
@@ -65,7 +122,7 @@ def _own_points(pair: PairPrediction, matches: StaticMatches, sigma_ratio: float
     return OwnPoints(pair.ref.points, pair.new_own.points, weight, sigma_ratio)
 
 
-def _raw(pair: PairPrediction, matches: StaticMatches, own: OwnPoints | None, guess: Array) -> Array:
+def _raw(matches: StaticMatches, own: OwnPoints | None, guess: Array) -> Array:
     if own is not None:
         return procrustes(own.new, own.ref, (own.weight > 0).astype(float)).rigid
     return solve_pose(matches, guess, kernel_px=50.0, iterations=10).new_from_ref

@@ -1,11 +1,10 @@
-"""What an alignment gives back: the transform and how far to trust it."""
+"""What an alignment gives back: the transform and how well it fits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -21,10 +20,10 @@ class Alignment:
     iterations: int
     inlier_ratio: float  # share of the weighted matches within 2 px (3 sigma for own points)
     error_px: float  # median re-mapping residual of the weighted matches, inf without any
-    information: Array  # (6, 6) of a left perturbation of new_from_ref, unit pixel noise
     stages: tuple[str, ...]  # what ran, in order
+    has_failed: bool = False  # nothing could be solved; the pose is the guess
 
     @staticmethod
     def failed(new_from_ref: Array, stage: str) -> Alignment:
         """Nothing could be solved; the pose is the guess."""
-        return Alignment(new_from_ref, 1.0, False, 0, 0.0, float("inf"), np.zeros((6, 6)), (stage,))
+        return Alignment(new_from_ref, 1.0, False, 0, 0.0, float("inf"), (stage,), True)

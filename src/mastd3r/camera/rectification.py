@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError
-from ..types import Frame
 from .opencv_lens import OpenCvLens, lens_from_intrinsics
 from .pinhole import Camera
 
@@ -60,15 +58,6 @@ class Rectifier:
         line = f"lens: photographs rectified to a pinhole of {self.lens.focal_px:.1f} px, {self.size[0]}x{self.size[1]}"
         cut = f"; {outside:.1%} of the photograph is outside, where masks repeat the nearest pixel"
         return line + (cut if outside > 0.0005 else "")
-
-    def frame(self, frame: Frame) -> Frame:
-        """A photograph with all it carries, seen by the pinhole."""
-        return replace(
-            frame,
-            image=self.image(frame.image),
-            depth_m=None if frame.depth_m is None else self.depth(frame.depth_m),
-            semantic=None if frame.semantic is None else self.semantic(frame.semantic),
-        )
 
     def image(self, image: Array) -> Array:
         """(h, w, 3) uint8 photograph to the pinhole's. Linear: OpenCV's cubic moves things by up to 0.05 px."""

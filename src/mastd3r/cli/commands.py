@@ -183,10 +183,11 @@ def _run_and_show(
     quiet: bool = False,
     maps: Path | None = None,
 ) -> int:
+    from ..pipeline import reconstruct
     from ..progress import Silent, Terminal
-    from ..reconstruct import run
 
-    result = run(source, out, config, command=words, reporter=Silent() if quiet else Terminal(console), maps=maps)
+    reporter = Silent() if quiet else Terminal(console)
+    result = reconstruct(source, out, config, maps=maps, command=words, reporter=reporter)
     Console().print(_table(result.metrics))
     Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]")
     return 0

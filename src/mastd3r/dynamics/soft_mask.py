@@ -18,6 +18,6 @@ def static_at(moving: Array, px: Array) -> Array:
     return 1.0 - moving[y, x].astype(float)
 
 
-def grown(moving: Array, by_px: int = 5) -> Array:
+def dilated(moving: Array, by_px: int = 5) -> Array:
     """P(moving) of the worst pixel within ``by_px``: a match's window there sees the moving thing too."""
     return cv2.dilate(moving.astype(np.float32), np.ones((2 * by_px + 1, 2 * by_px + 1), np.uint8))

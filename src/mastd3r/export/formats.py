@@ -27,7 +27,7 @@ COLMAP_CAMERA_ID = 1
 NO_ERROR_KNOWN = -1  # COLMAP's own mark for a point whose reprojection error was never computed
 
 
-def export_run(run_dir: Path, kind: ExportKind, out: Path) -> Path:
+def export_run(run_dir: Path, kind: str, out: Path) -> Path:
     """Write a run folder's result in another format; gives the path written.
 
     tum: ``out`` is a copy of trajectory.txt. kitti: a file of 12 numbers a row, the top of world_from_cam, one

@@ -63,3 +63,8 @@ def _static(points: Any, described: Any, moving: Array | None) -> tuple[Any, Any
     at = np.array([p.pt for p in points]).round().astype(int)
     still = np.flatnonzero(moving[at[:, 1], at[:, 0]] < 0.5)
     return [points[n] for n in still], described[still] if len(still) else None
+
+
+def build() -> OrbFeatures:
+    """The matcher with its defaults."""
+    return OrbFeatures()

@@ -20,6 +20,7 @@ from .factors import KeyframeVariables, ReprojectionFactor
 from .intrinsics import LATE, RADIAL, Intrinsics, camera_of
 
 Array = NDArray[Any]
+FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
@@ -104,6 +105,14 @@ class KeyframeGraph:
         return float(np.median(block.inv_depth[seen] if seen.sum() > 10 else block.inv_depth))
 
     # -- writing ---------------------------------------------------------------------------------------------
+
+    def believe_focal(self, focal_px: float | None) -> None:
+        """Start the lens at a focal length that a frame's own points speak of, where a camera may have it."""
+        low, high = FOCAL_RATIOS_BELIEVED
+        if focal_px is None or not low < focal_px / np.sqrt(self.size[0] * self.size[1]) < high:
+            return
+        values = np.concatenate([[np.log(focal_px)], self.intrinsics.values[1:]])
+        self.intrinsics = Intrinsics(values, values.copy(), self.intrinsics.prior_info)
 
     def add_keyframe(
         self,

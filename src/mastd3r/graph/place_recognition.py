@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import ConfigError
 from ..types import WorkFrame
 from .keyframe_graph import Keyframe, KeyframeGraph
 
@@ -28,8 +29,8 @@ class PlaceRecognition:
     ``describe`` gives a frame's descriptor, (c,) of unit norm: a thumbnail, or what a network has of it.
     """
 
-    def __init__(self, describe: Callable[[WorkFrame], Array] | None = None) -> None:
-        self._describe = describe or (lambda work: thumbnail(work.gray))
+    def __init__(self, describe: Callable[[WorkFrame], Array]) -> None:
+        self._describe = describe
         self._known: dict[int, tuple[int, Array]] = {}  # keyframe: (frame, descriptor)
 
     def best(
@@ -40,7 +41,7 @@ class PlaceRecognition:
         count: int = 3,
         min_similarity: float = -1.0,
     ) -> list[Keyframe]:
-        """Up to ``count`` keyframes of ``among`` that look most like ``seen``, best first; none below the likeness."""
+        """Up to ``count`` keyframes of ``among`` that look most like ``seen``, best first."""
         if not among:
             return []
         for k in among:
@@ -51,3 +52,16 @@ class PlaceRecognition:
         similarity = np.stack([self._known[k][1] for k in ids]) @ self._describe(seen)
         first = np.argsort(-similarity, kind="stable")[:count]
         return [graph.keyframes[ids[n]] for n in first if similarity[n] >= min_similarity]
+
+
+def build_thumbnail(provider: Any) -> Callable[[WorkFrame], Array]:
+    """Descriptors that need nothing but the grey image."""
+    return lambda work: thumbnail(work.gray)
+
+
+def build_of_provider(provider: Any) -> Callable[[WorkFrame], Array]:
+    """The descriptor that the pointmap network has of a frame. Raises ConfigError for a provider without one."""
+    describe: Callable[[WorkFrame], Array] | None = getattr(provider, "place_descriptor", None)
+    if describe is None:
+        raise ConfigError(f"places: expected pointmaps that describe places, got {provider.name}; use thumbnail")
+    return describe

@@ -43,27 +43,26 @@ class LiveMap:
         self._config, self._process = config, MapProcess(config.mapping, config.seed, device)
         self._waiting: dict[int, _Seen] = {}  # keyframe id -> what it needs
         self._sent: list[int] = []
-        self._recent: deque[tuple[int, Frame, Frame]] = deque(maxlen=RECENT)
+        self._recent: deque[tuple[int, Frame]] = deque(maxlen=RECENT)
         self._paid_until = 0  # frames whose steps have been paid for
         self._known = 0
 
     def after(
         self,
         position: int,
-        photograph: Frame,
-        tracked: Frame,
+        frame: Frame,
         graph: KeyframeGraph,
         lens: Callable[[], Camera | OpenCvLens],
     ) -> None:
         """One frame of tracking is done; ``position`` counts the frames read, ``lens`` is over the photograph."""
-        self._recent.append((position, photograph, tracked))
+        self._recent.append((position, frame))
         if len(graph.keyframes) == self._known:
             return
         for kf in graph.keyframes[self._known :]:
-            for at, photo, shown in self._recent:
-                if kf.work.index == photo.index and not is_holdout(at):
+            for at, shown in self._recent:
+                if kf.work.index == shown.index and not is_holdout(at):
                     small = cv2.resize(shown.image, graph.size, interpolation=cv2.INTER_AREA)
-                    self._waiting[kf.id] = _Seen(photo, small)
+                    self._waiting[kf.id] = _Seen(shown.as_taken, small)
         self._known = len(graph.keyframes)
         if graph.initialised and graph.submap_of[self._known - 1] == graph.submap_of[0]:
             if self._sent:

@@ -84,7 +84,7 @@ def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
     if kind == "spz":
         write_gaussians_spz(out, gaussians)
         return out
-    lens, facts = _lens(run), _facts(run)
+    lens, facts = lens_of(run), _facts(run)
     splat = Splat(gaussians, facts["near"], facts["background"])
     if kind == "flight":
         poses = flight_path(run.trajectory.timestamps_s, run.trajectory.world_from_cam)
@@ -102,7 +102,7 @@ def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
     return out
 
 
-def _lens(run: Run) -> Camera | OpenCvLens:
+def lens_of(run: Run) -> Camera | OpenCvLens:
     """The lens of camera.json; one with more than radial terms is OpenCV's."""
     c = run.camera
     if c is None:

@@ -1,4 +1,4 @@
-"""The second look at every frame, with final poses: masks, training views for the map, colours of the cloud."""
+"""III-A once more with final poses, forwards and backwards: masks, training views for the map, colours of the cloud."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from ..camera.map_view import MapView
 from ..camera.rectification import Rectifier
 from ..concurrency import Future, Worker, prefetch
 from ..config import HOLDOUT_EVERY, Config
-from ..dynamics.appearance import AppearanceClassifier
 from ..dynamics.data import DynamicMask, DynamicsInput
 from ..dynamics.flow import HalfFlow
-from ..dynamics.smoother import ForwardBackwardSmoother
 from ..dynamics.soft_mask import static_at
 from ..dynamics.uncertainty import RESIDUAL_MAX_PX, SeenFrom, reprojection_residual_px, uncertainty_weight
 from ..geometry.se3 import inverse, transform
 from ..graph.keyframe_graph import KeyframeGraph
 from ..parts import Parts
-from ..sources.rectified import tracked_frames
+from ..sources.rectified import rectified
 from ..tracking.mask_input import dynamics_input
+from ..tracking.observation import Observer
 from ..types import Frame, View, WorkFrame
 from .final_solve import FinalFrame
 from .point_votes import PointVotes
@@ -72,8 +71,8 @@ class _Waiting:
 
 
 @dataclass(frozen=True)
-class Look:
-    """What the second pass needs beside the frames."""
+class SmoothingContext:
+    """What the smoothing pass needs beside the frames."""
 
     final: list[FinalFrame]
     graph: KeyframeGraph
@@ -81,7 +80,7 @@ class Look:
     config: Config
     map_view: MapView
     rectifier: Rectifier | None = None
-    head: AppearanceClassifier | None = None  # what tracking learned of the looks of moving things
+    appearance: Any = None  # what tracking learned of the looks of moving things
 
 
 @dataclass(frozen=True)
@@ -94,82 +93,80 @@ class FrameMask:
     over_photograph: Array  # (h, w) float32 P(moving) over the photograph at working scale
 
 
-def smooth_masks(frames: Iterator[Frame], look: Look, on_mask: Callable[[FrameMask], None]) -> SmoothedMasks:
+def smooth_masks(
+    frames: Iterator[Frame], context: SmoothingContext, on_mask: Callable[[FrameMask], None]
+) -> SmoothedMasks:
     """Masks of every frame with the final poses and depths; views thinned evenly to ``mapping.max_views``.
 
     ``frames`` are photographs, and ``map_view`` is of their lens. Where that was calibrated, ``rectifier`` makes
     them what tracking saw. A mask waits for frames after it, so a few frames are held, never the video.
     """
-    out, waiting, votes = SmoothedMasks(), deque[_Waiting](), PointVotes()
-    graph, parts, map_view = look.graph, look.parts, look.map_view
-    chosen = _view_positions(look.final, look.config)
-    belief = ForwardBackwardSmoother(
-        look.config.dynamics, *parts.size, look.head or AppearanceClassifier(look.config.dynamics)
-    )
+    out, votes = SmoothedMasks(), PointVotes()
+    graph, parts = context.graph, context.parts
+    chosen = _view_positions(context.final, context.config)
+    smoother = parts.dynamics.smoother(*parts.provider.size, context.appearance)
     uncoloured: list[int] = []  # keyframes without colours yet
     written = deque[Future[None]]()
-    inputs = prefetch(_inputs(frames, look, chosen, waiting), lambda _, __: None, lambda: None)
+    inputs = prefetch(_inputs(frames, context, chosen), lambda _, __: None, lambda: None)
     with Worker("masks") as writer:
-        for mask in belief.masks(inputs):
-            one = waiting.popleft()
-            place = one.place
+        for mask, waiting in smoother.masks(inputs):
+            place = waiting.place
             out.late.see(graph, place.record, mask.probability)
-            moving = _over_photograph(mask.probability, look.rectifier)
-            shown = FrameMask(place.record.timestamp_s, one.small, mask, moving)
+            moving = _over_photograph(mask.probability, context.rectifier)
+            shown = FrameMask(place.record.timestamp_s, waiting.small, mask, moving)
             written.append(writer.submit(partial(on_mask, shown)))
             if len(written) > SHOWN_LATE:
                 written.popleft().get()
             if place.record.is_keyframe:
                 uncoloured.append(place.record.kf_id)
-            if is_holdout(one.position):
+            if is_holdout(waiting.position):
                 out.holdout.append(place)
                 continue
             for kf_id in uncoloured:  # a holdout keyframe takes its colours from the frame after it
-                out.colors[kf_id], p, _ = _seen_by(one.small, mask.probability, graph, kf_id, place)
+                out.colors[kf_id], p, _ = _seen_by(waiting.small, mask.probability, graph, kf_id, place)
                 votes.start(kf_id, p, out.colors[kf_id])
             uncoloured.clear()
             kf_id = place.record.kf_id
             if kf_id in out.colors and not place.record.is_keyframe:
-                colors, p, inside = _seen_by(one.small, mask.probability, graph, kf_id, place)
+                colors, p, inside = _seen_by(waiting.small, mask.probability, graph, kf_id, place)
                 votes.add(kf_id, p, colors, inside)
-            if one.photograph is not None:
-                uncertainty = one.uncertainty
-                if uncertainty is not None:
-                    uncertainty = map_view.pinhole_map(_over_photograph(uncertainty, look.rectifier))
-                out.views.append(_view(one.photograph, place, moving, uncertainty, map_view))
+            if waiting.photograph is not None:
+                out.views.append(_view(waiting, moving, context))
         while written:
             written.popleft().get()
     out.moving = votes.moving()
     return out
 
 
-def _inputs(frames: Iterator[Frame], look: Look, chosen: set[int], waiting: deque[_Waiting]) -> Iterator[DynamicsInput]:
-    """What the mask is told of each frame; what is needed once the mask is there goes to ``waiting``."""
-    by_index = {f.record.index: f for f in look.final}
-    graph, parts = look.graph, look.parts
-    photographs: deque[Frame] = deque()
-    flow = HalfFlow(parts.size[0] // 2, parts.size[1] // 2)
-    tracked = tracked_frames(frames, look.rectifier, photographs)
+def _inputs(
+    photographs: Iterator[Frame], context: SmoothingContext, chosen: set[int]
+) -> Iterator[tuple[DynamicsInput, _Waiting]]:
+    """What the mask is told of each frame, and what is needed once the mask is there."""
+    by_index = {f.record.index: f for f in context.final}
+    graph, parts, map_view, rectifier = context.graph, context.parts, context.map_view, context.rectifier
+    observer, size = Observer(parts), parts.provider.size
+    flow = HalfFlow(size[0] // 2, size[1] // 2)
+    frames = photographs if rectifier is None else (rectified(p, rectifier) for p in photographs)
 
-    def near(seen: Frame) -> WorkFrame | None:
-        place = by_index.get(seen.index)
+    def near(frame: Frame) -> WorkFrame | None:
+        place = by_index.get(frame.index)
         return None if place is None else graph.keyframes[place.record.kf_id].work
 
-    for position, seen in enumerate(parts.prefetched(tracked, lambda: near)):
-        frame, place = photographs.popleft(), by_index.get(seen.index)
+    for position, frame in enumerate(observer.prefetched(frames, lambda: near)):
+        place = by_index.get(frame.index)
         if place is None:
             return
-        work = parts.observe(seen, near(seen))
-        small = cv2.resize(seen.image, parts.size, interpolation=cv2.INTER_AREA)
-        features = parts.describe(seen) if look.config.dynamics.use_head else None
-        given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, work, 1.0, features)
+        seen = observer.observe(frame, near(frame))
+        small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+        features = seen.features.get()
+        given = dynamics_input(graph, place.record.kf_id, place.world_from_cam, seen.work, 1.0, features)
         photograph = uncertainty = None
         if position in chosen:
-            photograph = look.map_view.pinhole_image(frame.image)
-            uncertainty = _uncertainty(place, graph, given, flow, look.map_view.tau_px)
-        waiting.append(_Waiting(position, place, small, photograph, uncertainty))
+            photograph = map_view.pinhole_image(frame.as_taken.image)
+            uncertainty = _uncertainty(place, graph, given, flow, map_view.tau_px)
         given = replace(given, color=small)
-        yield given if parts.own_scale_known else _at_expected_scale(given)
+        given = given if parts.provider.own_scale_known else _at_expected_scale(given)
+        yield given, _Waiting(position, place, small, photograph, uncertainty)
 
 
 def _at_expected_scale(given: DynamicsInput) -> DynamicsInput:
@@ -216,14 +213,13 @@ def _over_photograph(values: Array, rectifier: Rectifier | None) -> Array:
     return values if rectifier is None else rectifier.as_photograph(values)
 
 
-def _view(
-    photograph: tuple[Array, Array],
-    place: FinalFrame,
-    moving: Array,
-    uncertainty: Array | None,
-    map_view: MapView,
-) -> View:
-    image, inside = photograph
+def _view(waiting: _Waiting, moving: Array, context: SmoothingContext) -> View:
+    """The training view of a frame whose mask is there, ``moving`` over its photograph."""
+    assert waiting.photograph is not None
+    (image, inside), place, map_view = waiting.photograph, waiting.place, context.map_view
+    uncertainty = waiting.uncertainty
+    if uncertainty is not None:
+        uncertainty = map_view.pinhole_map(_over_photograph(uncertainty, context.rectifier))
     p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
     static = np.clip(1 - map_view.pinhole_map(p), 0.01, 1) * inside  # exactly 0 means: no data
     return View(

@@ -1,8 +1,7 @@
-"""Pointmaps from images alone: dense flow, the lens found by the graph, and triangulation (the embedded default)."""
+"""Pointmaps from images alone: dense flow, and depths and lens as the graph finds them (the embedded default)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -10,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
-from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
-from .base import Observing
+from ..config import Config
+from ..errors import InputError
+from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, Source, WorkFrame
+from .base import Provider
 from .flow import FlowMatcher, corner_grid
 
 Array = NDArray[Any]
@@ -26,16 +27,14 @@ def working_size(width: int, height: int, area_px: int) -> tuple[int, int]:
     return max(16, round(width * scale)), max(16, round(height * scale))
 
 
-class GeometricPointmaps(Observing):
+class GeometricPointmaps(Provider):
     """Provider that needs no weights and no depth sensor."""
 
     name = "geometric"
-    depth_sigma_ratio: float | None = None
-    finds_far = False
-    side_by_side = True
 
     def __init__(self, width: int, height: int, cell_px: int) -> None:
         self.width, self.height, self.cell_px = width, height, cell_px
+        self.size = (width, height)
         self.flow = FlowMatcher(width, height)
 
     def look(self, frame: Frame) -> WorkFrame:
@@ -54,27 +53,12 @@ class GeometricPointmaps(Observing):
     def _own_inv_depth(self, frame: Frame) -> Array | None:
         return None
 
-    def beside(self, work: WorkFrame, near: WorkFrame | None) -> WorkFrame:
-        """The frame as it is: all that is known of it is known alone."""
-        return work
-
-    def expect(self, pairs: Sequence[tuple[WorkFrame, WorkFrame]]) -> None:
-        """Nothing to prepare."""
-
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
-        """Match ref's pixels in new; points by ref's depth where it is known, by triangulation otherwise."""
+        """Match ref's pixels in new, eq. (7); ref's points stand at the depth that is known of them."""
         found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow, near=guess.flow_is_near)
         matches = Matches(ref.px, found.target, found.weight * ref.texture)
-        rays = guess.camera.rays(ref.px)
-        ref_map = _known_points(ref.px, rays, guess)
-        new_map = ref_map
-        if guess.new_from_ref is not None:
-            inv_depth, confidence = triangulate(matches, guess.new_from_ref, guess.camera)
-            points = rays / np.maximum(inv_depth, 1e-6)[:, None]
-            new_map = Pointmap(found.target, points, confidence)
-            if guess.ref_inv_depth is None:
-                ref_map = Pointmap(ref.px, points, confidence)
-        return PairPrediction(matches, ref_map, new_map, self._own_points(new, matches, guess.camera), found.dense)
+        ref_map = _known_points(ref.px, guess.camera.rays(ref.px), guess)
+        return PairPrediction(matches, ref_map, self._own_points(new, matches, guess.camera), found.dense)
 
     def _own_points(self, new: WorkFrame, matches: Matches, camera: Camera) -> Pointmap | None:
         return None
@@ -87,27 +71,6 @@ def _known_points(px: Array, rays: Array, guess: Guess) -> Pointmap:
     info = np.zeros(len(px)) if guess.ref_depth_info is None else guess.ref_depth_info
     sigma_ratio = 1 / np.sqrt(np.maximum(info, 1e-12)) * depth
     return Pointmap(px, rays * depth[:, None], 1 / (1 + (sigma_ratio / 0.1) ** 2))
-
-
-def triangulate(matches: Matches, new_from_ref: Array, camera: Camera) -> tuple[Array, Array]:
-    """Inverse depth (p,) in ref of each match under a known pose, and an honest confidence (p,) in 0..1.
-
-    Linear in the inverse depth: cross(ray_new, R ray_ref + t d) = 0. The confidence is the match's weight, times
-    how surely the parallax fixes the depth (1 px of noise), times how well the match keeps the epipolar line.
-    """
-    rotated = camera.rays(matches.ref_px) @ new_from_ref[:3, :3].T
-    rays_new = camera.rays(matches.new_px)
-    t = new_from_ref[:3, 3]
-    # pixel rows: x' (rz + tz d) = rx + tx d
-    a = t[:2] - rays_new[:, :2] * t[2]
-    b = rays_new[:, :2] * rotated[:, 2:] - rotated[:, :2]
-    norm = (a**2).sum(1)
-    inv_depth = (a * b).sum(1) / np.maximum(norm, 1e-12)
-    epipolar_px = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) / np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px
-    sigma = 1 / (np.sqrt(np.maximum(norm, 1e-12)) * camera.fx_px)
-    sure = 1 / (1 + (sigma / np.maximum(inv_depth, 1e-6) / 0.1) ** 2)
-    confidence = matches.weight * sure * np.exp(-0.5 * epipolar_px**2) * (inv_depth > 0)
-    return np.maximum(inv_depth, 1e-6), confidence
 
 
 class SensorDepthPointmaps(GeometricPointmaps):
@@ -144,3 +107,15 @@ def sample_own(frame: WorkFrame, px: Array) -> Array:
     x = np.clip(np.round(px[:, 0]).astype(int), 0, own.shape[1] - 1)
     y = np.clip(np.round(px[:, 1]).astype(int), 0, own.shape[0] - 1)
     return smooth[y, x].astype(float)
+
+
+def build_geometric(config: Config, source: Source) -> GeometricPointmaps:
+    """The provider for a source, at the working size that the options give."""
+    return GeometricPointmaps(*working_size(*source.size, config.tracking.area_px), config.tracking.cell_px)
+
+
+def build_sensor_depth(config: Config, source: Source) -> SensorDepthPointmaps:
+    """The same with the depth that the frames carry. Raises InputError for a source without depth."""
+    if not source.has_depth:
+        raise InputError(f"--pointmaps depth: expected a TUM-layout folder with depth.txt, {source.name} has no depth")
+    return SensorDepthPointmaps(*working_size(*source.size, config.tracking.area_px), config.tracking.cell_px)

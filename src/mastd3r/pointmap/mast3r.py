@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..errors import InputError
-from ..geometry.sim3 import Sim3, procrustes
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
-from .base import Observing
+from .base import Provider
 from .geometric import GeometricPointmaps
 from .matching import FoundPixels, MatchOptions, ViewMaps, match_pixels, subsampled
 from .network_view import Window, as_array, corner_of, focal_from_points, in_window, own_inv_depth, sample_smooth
@@ -87,22 +86,22 @@ class _HostMaps:
         return as_array(self._maps.descriptor_confidence)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class NetworkFrame(WorkFrame):
     """A working frame that the network can be shown."""
 
     prepared: Any  # the network's image, to encode it again should its tokens be forgotten
     window: Window
     serial: int  # one a call of observe
-    focal_px: float | None  # the lens that its points speak of, at working size; None: they speak of none
 
 
-class Mast3rPointmaps(Observing):
+class Mast3rPointmaps(Provider):
     """Provider over an injected network. It remembers tokens and pairs; one thread at a time asks the network."""
 
     name = "mast3r"
     finds_far = True  # the search on rays finds its way from the same pixel, without a start
     side_by_side = False  # one accelerator, and a memory of pairs
+    own_scale_known = False
 
     def __init__(
         self,
@@ -116,14 +115,18 @@ class Mast3rPointmaps(Observing):
         remembered_frames: int = 48,
         remembered_pairs: int = 4,
         depth_sigma_ratio: float = 0.08,
+        prefetches_pairs: bool = False,
+        notes: tuple[str, ...] = (),
     ) -> None:
         """``width`` and ``height`` are those of ``working_size_of``; maps on a device want a matcher for them."""
         self.network, self.width, self.height, self.cell_px = network, width, height, cell_px
+        self.size = (width, height)
         self.options, self.matcher = options or MatchOptions(), matcher
         self._look = GeometricPointmaps(width, height, cell_px)
         self._encoded: _Remembered[Any] = _Remembered(remembered_frames)
         self._pairs: _Remembered[Any] = _Remembered(remembered_pairs)
         self.depth_sigma_ratio: float | None = depth_sigma_ratio
+        self.prefetches_pairs, self.notes = prefetches_pairs, notes
         self._serial = itertools.count()
         self._asking = RLock()
 
@@ -141,7 +144,7 @@ class Mast3rPointmaps(Observing):
                 f"got {w}x{h} pixels, which give {window.resized_size[0]}x{window.resized_size[1]}"
             )
         seen = _fields(self._look.look(frame))
-        work = NetworkFrame(**seen, prepared=prepared, window=window, serial=next(self._serial), focal_px=None)
+        work = NetworkFrame(**seen, prepared=prepared, window=window, serial=next(self._serial))
         self._tokens(work)
         return work
 
@@ -170,7 +173,7 @@ class Mast3rPointmaps(Observing):
             self._decode_all(wanted)
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
-        """Ref's chosen pixels found in new, and both pointmaps in ref's camera, in the scale of guess.ref_inv_depth.
+        """Ref's chosen pixels found in new, eq. (7), and ref's points in the scale of guess.ref_inv_depth.
 
         ``guess.flow`` is where the search starts. ``new_own`` keeps new's own scale.
         """
@@ -181,8 +184,7 @@ class Mast3rPointmaps(Observing):
         ref_map = _along_rays(a, a.px, guess.camera, _at(pair.second.confidence, a.window, a.px), factor)
         confidence = _at(pair.first.confidence, b.window, matches.new_px) * (matches.weight > 0)
         own = _along_rays(b, matches.new_px, guess.camera, confidence, 1.0)
-        new_map = _moved(own, ref_map, matches.weight)
-        return PairPrediction(matches, ref_map, new_map, own, flow)
+        return PairPrediction(matches, ref_map, own, flow)
 
     def place_descriptor(self, work: WorkFrame) -> Array:
         """(c,) float32 of unit length, alike where two frames show the same place: the mean token. 0 if not finite."""
@@ -303,20 +305,6 @@ def _scale_to(guess: Guess, own_inv_depth: Array) -> float:
     sure = guess.ref_depth_info * guess.ref_inv_depth**2 > 1 / 0.15**2
     sure &= (own_inv_depth > 0) & (guess.ref_inv_depth > 0)
     return float(np.median(own_inv_depth[sure] / guess.ref_inv_depth[sure])) if sure.sum() >= 20 else 1.0
-
-
-def _moved(own: Pointmap, ref: Pointmap, weight: Array) -> Pointmap:
-    """New's own points in ref's camera, by the closed form over the matches, the worst of them fading out."""
-    w = weight * (own.confidence > 0) * (ref.confidence > 0)
-    if (w > 0).sum() < 6:
-        return Pointmap(own.px, own.points, np.zeros(len(own.px)))
-    for _ in range(4):
-        ref_from_new: Sim3 = procrustes(ref.points, own.points, w, with_scale=True)
-        moved = ref_from_new.apply(own.points)
-        away = np.linalg.norm(moved - ref.points, axis=1) / np.maximum(ref.points[:, 2], 1e-9)
-        usual = max(2 * float(np.median(away[w > 0])), 1e-6)
-        w = weight * (own.confidence > 0) * (ref.confidence > 0) / (1 + (away / usual) ** 2)
-    return Pointmap(own.px, moved, own.confidence)
 
 
 def _flow_at(flow: Array, px: Array) -> Array:

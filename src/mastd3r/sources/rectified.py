@@ -1,17 +1,24 @@
-"""A source whose photographs are made pinhole images before they are tracked."""
+"""Photographs of a calibrated lens as pinhole images, before they are tracked; each keeps the one it was made of."""
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from typing import Any
-
-from numpy.typing import NDArray
+from dataclasses import replace
 
 from ..camera.rectification import Rectifier
 from ..types import Frame, Source
 
-Array = NDArray[Any]
+
+def rectified(photograph: Frame, rectifier: Rectifier) -> Frame:
+    """A photograph with all it carries, seen by the pinhole; it stands in ``Frame.photograph``."""
+    depth_m, semantic = photograph.depth_m, photograph.semantic
+    return replace(
+        photograph,
+        image=rectifier.image(photograph.image),
+        depth_m=None if depth_m is None else rectifier.depth(depth_m),
+        semantic=None if semantic is None else rectifier.semantic(semantic),
+        photograph=photograph,
+    )
 
 
 class RectifiedSource:
@@ -27,11 +34,4 @@ class RectifiedSource:
 
     def frames(self) -> Iterator[Frame]:
         """Frame after frame, rectified; errors are those of the source."""
-        return (self._rectifier.frame(frame) for frame in self._source.frames())
-
-
-def tracked_frames(photographs: Iterator[Frame], rectifier: Rectifier | None, untaken: deque[Frame]) -> Iterator[Frame]:
-    """What tracking is shown of each photograph. The photographs go to ``untaken``, for the caller to take in order."""
-    for photograph in photographs:
-        untaken.append(photograph)
-        yield photograph if rectifier is None else rectifier.frame(photograph)
+        return (rectified(frame, self._rectifier) for frame in self._source.frames())

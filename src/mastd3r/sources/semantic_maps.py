@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from ..config import Config
 from ..errors import InputError
+from ..types import Frame, Source
 from .image_files import MAP_SUFFIXES
 from .notes import Notes
 
@@ -78,3 +81,29 @@ def _by_time(files: Mapping[str, Path], times_s: Mapping[int, float]) -> tuple[s
     stamped.sort()
     at = nearest_time(np.array([t for t, _ in stamped]), np.array(list(times_s.values()), float))
     return "timestamp", {i: stamped[k][1] for i, k in zip(times_s, at, strict=True) if k >= 0}
+
+
+class FromSource:
+    """The semantic prior that frames carry already, if any."""
+
+    notes: tuple[str, ...] = ()
+
+    def fill(self, frame: Frame) -> Frame:
+        """The frame as it is."""
+        return frame
+
+    def features(self, frame: Frame) -> Any:
+        """None: descriptors are made of the image."""
+        return None
+
+
+def build_none(config: Config, source: Source) -> FromSource:
+    """No prior: the source was opened without maps."""
+    return FromSource()
+
+
+def build_maps(config: Config, source: Source) -> FromSource:
+    """The source's own maps. Raises InputError where it has none."""
+    if not source.has_semantic:
+        raise InputError(f"--semantics maps: expected probability maps beside the frames, {source.name} has none")
+    return FromSource()

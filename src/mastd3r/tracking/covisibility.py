@@ -1,4 +1,4 @@
-"""Matches between keyframes: what a new one is tied to."""
+"""Edges between keyframes that see the same: their matches, found both ways."""
 
 from __future__ import annotations
 
@@ -28,36 +28,36 @@ class CovisibilityEdges:
         self.config, self.parts = config, parts
         self.flows: dict[tuple[int, int], Array] = {}  # between keyframes, before there are poses
 
-    def tie(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> KeyframeGraph:
+    def connect(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> KeyframeGraph:
         """Matches of ``kf`` with the keyframes before ``before`` and older ones that see the same; the window solved.
 
         ``graph`` has poses; it is returned.
         """
-        recent = self.to_recent(graph, kf, before)
+        recent = self.add_recent(graph, kf, before)
         c = self.config
         older = covisible(graph, kf.id, min(recent, default=before), c.covisible, c.loop_overlap_ratio)
         self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in older])
         for k in older:
-            self.both(graph, k, kf.id)
+            self.add(graph, k, kf.id)
         graph.solve_window()
         return graph
 
-    def to_recent(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> list[int]:
+    def add_recent(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> list[int]:
         """Matches with the ``neighbours`` last keyframes; those but ``before``, with which there are some already."""
         recent = [k for k in graph.members()[-2 - self.config.neighbours : -1] if k != before]
         self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before, *reversed(recent))])
         for k in reversed(recent):
-            self.both(graph, k, kf.id)
+            self.add(graph, k, kf.id)
         return recent
 
-    def both(self, graph: KeyframeGraph, i: int, j: int) -> bool:
+    def add(self, graph: KeyframeGraph, i: int, j: int) -> bool:
         """Edges both ways; False where one fails, or where nothing says how to start."""
         found = self._found(graph, i, j)
         graph.edges += found
         return len(found) == 2
 
-    def many(self, graph: KeyframeGraph, pairs: Sequence[tuple[int, int]]) -> int:
-        """``both`` of many pairs, in this order; how many have edges both ways. ``graph`` has poses."""
+    def add_many(self, graph: KeyframeGraph, pairs: Sequence[tuple[int, int]]) -> int:
+        """``add`` of many pairs, in this order; how many have edges both ways. ``graph`` has poses."""
 
         def search(pair: tuple[int, int]) -> list[ReprojectionFactor]:
             return self._found(graph, *pair)
@@ -68,7 +68,7 @@ class CovisibilityEdges:
             graph.edges += edges
         return sum(len(edges) == 2 for edges in found)
 
-    def one(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
+    def add_one_way(self, graph: KeyframeGraph, i: int, j: int, flow: Array) -> bool:
         """The edge of i's pixels in j, searched from ``flow`` (h, w, 2)."""
         edge = self._edge(graph, i, j, flow)
         if edge is not None:

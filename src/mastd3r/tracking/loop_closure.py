@@ -26,11 +26,11 @@ APART = 3  # keyframes between two of one place, below: they are neighbours
 MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be believed
 SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
-WIDE_OVERLAP, WIDE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
-WIDE_PAIRS = 4  # of those for each keyframe, at most
+COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
+COVISIBLE_PAIRS = 4  # of those for each keyframe, at most
 
 
-def close_loops(comparer: TwoViewEstimator, graph: KeyframeGraph, places: PlaceRecognition) -> list[Loop]:
+def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceRecognition) -> list[Loop]:
     """Keyframes of the submap being tracked that look alike, far apart in time: verified both ways, and closed.
 
     Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised.
@@ -41,8 +41,8 @@ def close_loops(comparer: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
         kf = graph.keyframes[j]
         far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
         for other in places.best(graph, kf.work, far, 2, MIN_SIMILARITY):
-            there = comparer.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
-            back = comparer.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
+            there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
+            back = two_view.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
             loop = _loop(graph, other.id, j, there, back)
             if loop is None or there is None or back is None:
                 continue
@@ -88,11 +88,11 @@ def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: Two
     return Loop(i, j, j_from_i, scale, float(better.weight.sum()))
 
 
-def widen(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
+def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
     """Match all pairs of keyframes that should see the same by their poses and were not matched before; how many.
 
-    While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time ties
-    the chain together across them. At most ``WIDE_PAIRS`` a keyframe, those that share most first.
+    While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time holds
+    the chain together across them. At most ``COVISIBLE_PAIRS`` a keyframe, those that share most first.
     """
     ids = graph.members()
     done = graph.connected_pairs()
@@ -103,8 +103,8 @@ def widen(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int])
         for b, j in enumerate(ids[:a]):
             share = min(shared[i][0][b], shared[j][0][a])
             motion = max(shared[i][1][b], shared[j][1][a])
-            if share >= WIDE_OVERLAP and motion <= WIDE_MOTION and frozenset((i, j)) not in done:
+            if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION and frozenset((i, j)) not in done:
                 pairs.append((-share, j, i))
-    made = connect([(i, j) for _, i, j in sorted(pairs)[: WIDE_PAIRS * len(ids)]])
+    made = connect([(i, j) for _, i, j in sorted(pairs)[: COVISIBLE_PAIRS * len(ids)]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made

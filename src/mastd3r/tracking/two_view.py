@@ -1,4 +1,4 @@
-"""One pair, compared: pointmaps, mask and pose. Tracking, loops, recovery and joining all come here."""
+"""Two views: a keyframe, whose depths the graph knows, and a frame. Tracking, recovery and joining all come here."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..alignment.align import align
+from ..alignment.problem import AlignmentProblem
 from ..alignment.reproject import StaticMatches
 from ..alignment.result import Alignment
 from ..concurrency import Future
@@ -17,6 +18,8 @@ from ..dynamics.soft_mask import static_at
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..parts import Parts
 from ..types import Guess, Matches, PairPrediction, WorkFrame
+from .observation import Observation
+from .state import TrackingState
 
 Array = NDArray[Any]
 THIN = 0.3  # share of a keyframe's static points that are matched, below: another start is tried
@@ -24,8 +27,9 @@ THIN = 0.3  # share of a keyframe's static points that are matched, below: anoth
 
 @dataclass(frozen=True)
 class TwoView:
-    """One pair, compared: what the provider said, the static weight of its matches, and the pose."""
+    """One pair, estimated: what the provider said, the static weight of its matches, and the pose."""
 
+    anchor: Keyframe
     pair: PairPrediction
     weight: Array  # (p,) static weight of each match
     alignment: Alignment
@@ -34,42 +38,59 @@ class TwoView:
 
 
 class TwoViewEstimator:
-    """The front end for one pair: a keyframe, whose depths the graph knows, and a frame."""
+    """Matches a pair under the static weights, and aligns it."""
 
     def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph) -> None:
         self.config, self.parts, self.graph = config, parts, graph
 
-    def compare(
+    def match(self, state: TrackingState, seen: Observation, prior: Future[Array]) -> AlignmentProblem:
+        """The frame against the keyframe that is followed, eq. (5)-(7), from where the last frame was."""
+        if state.anchor is None or seen.blank:
+            return AlignmentProblem.nothing(state.cam_from_anchor)
+        return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor)
+
+    def problem(
         self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, near: bool = True
-    ) -> TwoView:
+    ) -> AlignmentProblem:
         """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
         ``near``: within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
-        graph, started = self.graph, self.graph.submap_of[ref.id] in self.graph.started
-        block = graph.variables[ref.id]
-        inv_depth, info = (block.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
+        graph, started = self.graph, self._started(ref)
+        variables = graph.variables[ref.id]
+        inv_depth, info = (variables.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
         known = Guess(graph.camera(), inv_depth, info, guess if started else None)
 
         def matched(start: Array | None) -> tuple[PairPrediction, Array]:
-            # III-A: both pointmaps, in ref's camera
-            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))
-            # (5)(6), softly
+            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))  # (7)
+            # (5)(6), softly: a match weighs as much as both its ends are static
             return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
         pair, weight = matched(flow)
         if near and matched_share(ref, weight) < THIN and (start := self._far_start(ref, new, prior)) is not None:
             pair, weight = max((pair, weight), matched(start), key=lambda found: float(found[1].sum()))
-        if started:
-            info = graph.depth_info(ref.id)
-            matches = StaticMatches(
-                block.px, block.inv_depth, info, pair.matches.new_px, weight, graph.intrinsics.values
-            )
-            sigma = self.parts.provider.depth_sigma_ratio
-            alignment = align(pair, matches, guess, self.config.correction, self.config.alignment, sigma)  # III-B
-        else:
-            alignment = Alignment(guess, 1.0, True, 0, 1.0, 0.0, np.zeros((6, 6)), ("flow only",))
+        sigma = self.parts.provider.depth_sigma_ratio
+        if not started:
+            return AlignmentProblem(pair, weight, None, guess, sigma)
+        info, intrinsics = graph.depth_info(ref.id), graph.intrinsics.values
+        matches = StaticMatches(variables.px, variables.inv_depth, info, pair.matches.new_px, weight, intrinsics)
+        return AlignmentProblem(pair, weight, matches, guess, sigma)
+
+    def view(self, ref: Keyframe | None, problem: AlignmentProblem, alignment: Alignment) -> TwoView | None:
+        """The pair with its pose; None without an anchor."""
+        if ref is None:
+            return None
         # before a start nothing tells what moves, and what passes in front would make the keyframes
-        share = 0.75 if started else 0.5
-        return TwoView(pair, weight, alignment, *_motion(pair.matches, weight, self.parts.size, share))
+        share = 0.75 if self._started(ref) else 0.5
+        motion = _motion(problem.pair.matches, problem.weight, self.parts.provider.size, share)
+        return TwoView(ref, problem.pair, problem.weight, alignment, *motion)
+
+    def estimate(
+        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, near: bool = True
+    ) -> TwoView:
+        """``problem``, and its coarse, scale and fine stage in order."""
+        problem = self.problem(ref, new, prior, flow, guess, near)
+        view = self.view(ref, problem, align(self.parts.aligner, problem))
+        assert view is not None
+        return view
 
     def accepted(self, view: TwoView) -> bool:
         """Enough static matches, and enough of them agree on the pose."""
@@ -79,16 +100,19 @@ class TwoViewEstimator:
     def relocalised(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
         """``work`` seen from a keyframe that it may never have been near, then as ever.
 
-        A provider that finds what is far needs no start; for the others corner features give one.
+        A provider that finds what is far needs no start; for the others sparse features give one.
         """
         start = self._far_start(kf, work, prior)
         if start is None and not self.parts.provider.finds_far:
             return None
-        view = self.compare(kf, work, prior, start, np.eye(4), near=False)
+        view = self.estimate(kf, work, prior, start, np.eye(4), near=False)
         return view if self.accepted(view) else None
 
+    def _started(self, ref: Keyframe) -> bool:
+        return self.graph.submap_of[ref.id] in self.graph.started
+
     def _far_start(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> Array | None:
-        """Flow from corner features of the static scene; None where the provider needs none, or too few agree."""
+        """Flow from sparse features of the static scene; None where the provider needs none, or too few agree."""
         if self.parts.provider.finds_far:
             return None
         return self.parts.features.flow(kf.work.gray, work.gray, kf.moving / 255.0, prior.get())

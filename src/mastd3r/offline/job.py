@@ -1,0 +1,296 @@
+"""What a run leaves behind: its stages after tracking, their timings, and what is saved when one of them stops."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.map_view import MapView
+from ..camera.opencv_lens import OpenCvLens
+from ..camera.pinhole import Camera
+from ..camera.rectification import Rectifier
+from ..config import Config, config_to_yaml
+from ..errors import InputError, SlamError
+from ..evaluation.evaluate import evaluate
+from ..export.evidence import EvidenceSample
+from ..export.machine import peak_rss_mib
+from ..export.mask_video import MaskVideo
+from ..export.read_run import read_run
+from ..export.report import write_report
+from ..export.report_data import gather_report_data
+from ..export.run_folder import RunFolder
+from ..graph.keyframe_graph import KeyframeGraph
+from ..mapping.process import Outcome
+from ..mapping.rasterise import accelerator
+from ..parts import Parts
+from ..progress import Reporter
+from ..tracking.depth_prior import own_depth_spread
+from ..types import Frame, Source, StaticCloud
+from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
+from .live_map import LiveMap
+from .map_stage import train_map, write_renders_and_flight
+from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
+from .static_cloud import static_cloud
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class MapMaterial:
+    """What a map is made from."""
+
+    cloud: StaticCloud
+    seen: SmoothedMasks
+    map_view: MapView
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """What tracking shares with what comes after it."""
+
+    source: Source  # of photographs, as the camera took them
+    config: Config
+    graph: KeyframeGraph
+    parts: Parts
+    rectifier: Rectifier | None
+    map_device: str
+
+    def lens(self) -> Camera | OpenCvLens:
+        """The lens over the photograph: the calibrated one where photographs are rectified."""
+        if self.rectifier is not None:
+            return self.rectifier.lens
+        return self.graph.camera().resized(*self.source.size)
+
+
+class RunJob:
+    """One run in progress, as a context: whatever stops it, what was computed until then is written."""
+
+    def __init__(self, tracked: Tracked, folder: RunFolder, reporter: Reporter) -> None:
+        self.tracked, self.folder, self.reporter = tracked, folder, reporter
+        self.config, self.graph, self.source = tracked.config, tracked.graph, tracked.source
+        self.frames = 0  # that were tracked
+        self.metrics: dict[str, Any] = {}
+        self.timings: dict[str, float] = {}
+        self._began = time.perf_counter()
+        self._final: list[FinalFrame] = []
+        self._evidence: EvidenceSample | None = None  # of the frame that shows most
+        realtime = self.config.mapping.enabled and self.config.mapping.realtime
+        self._live = LiveMap(self.config, tracked.map_device) if realtime else None
+        self._begun: Outcome | None = None  # the map that was made while tracking
+        folder.write_config(config_to_yaml(self.config))
+        source, rectifier = self.source, tracked.rectifier
+        folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
+        folder.note(*tracked.parts.notes, *([rectifier.note] if rectifier is not None else []))
+
+    # -- while tracking ------------------------------------------------------------------------------------
+
+    def after(self, frame: Frame) -> None:
+        """One frame has been tracked: the map that is made meanwhile may take something of it."""
+        if self._live is not None:
+            self._live.after(self.frames, frame, self.graph, self.tracked.lens)
+        self.frames += 1
+
+    def check_tracked(self) -> None:
+        """Raise InputError for a source that had too little in it."""
+        self.folder.note(*self.source.notes)
+        name, count = self.source.name, self.frames
+        if count < 2:
+            raise InputError(f"{name}: expected at least 2 frames, got {count}")
+        if not self.graph.keyframes:
+            raise InputError(f"{name}: expected pictures with something in them, got {count} blank frames")
+
+    # -- the stages after it ---------------------------------------------------------------------------------
+
+    def solve(self) -> None:
+        """The joint optimisation over everything, and every frame's pose from it."""
+        graph, provider = self.graph, self.tracked.parts.provider
+        with self.timed("joint optimisation"):
+            if not finish_graph(graph, self.config, needs_motion=provider.depth_sigma_ratio is None):
+                self.folder.note(
+                    f"pointmaps {provider.name}: no depth was measured, no frame could be followed; every frame is "
+                    "given one pose, and neither path, cloud nor map mean anything"
+                )
+            assumed, found = provider.depth_sigma_ratio, own_depth_spread(graph)
+            if assumed is not None and found is not None:
+                spread = f"own depths differ from the solved ones by {found:.1%} (1 sigma), assumed {assumed:.1%}"
+                self.folder.note(spread)
+            self._final = final_frames(graph)
+            self._write_trajectory()
+            if self._live is not None:
+                self._begun, facts, note = self._live.finish(graph, self.tracked.lens)
+                self.folder.update(realtime=facts)
+                self.folder.note(note)
+
+    def smooth_masks(self, appearance: Any) -> MapMaterial:
+        """Masks under the final poses, every frame placed once more under them, and the static cloud."""
+        m = self.config.mapping
+        map_view = MapView(self.tracked.lens(), m.width_px, m.tau_uncertainty_px)
+        with self.timed("masks"):
+            seen = self._masks(map_view, appearance)
+        with self.timed("poses under the masks"):
+            if self.graph.started:
+                self._final = seen.late.poses(self.graph)
+                self._write_trajectory()
+                seen = seen.with_poses(self._final)
+        cloud = static_cloud(self.graph, seen.colors, seen.moving)
+        self.folder.write_cloud(cloud)
+        return MapMaterial(cloud, seen, map_view)
+
+    def make_map(self, material: MapMaterial) -> None:
+        """The Gaussian map, its renders of the holdout frames, and the flight through it."""
+        cloud, views = material.cloud, material.seen.views
+        if not self.config.mapping.enabled:
+            return
+        if not views or not len(cloud.points_world):
+            self.folder.note(f"no map: {len(views)} frames can show it, {len(cloud.points_world)} points start it")
+            return
+        with self.timed("map"):
+            trained = train_map(
+                self.folder, self.config, cloud, views, self.tracked.map_device, self._begun, self.reporter
+            )
+        self.metrics |= trained.metrics
+        write_renders_and_flight(
+            trained.mapper, self.folder, material.seen, material.map_view, self._final, self.tracked.lens(), self
+        )
+
+    def report(self) -> None:
+        """Figures against the truth, where there is one, and the report."""
+        elapsed = time.perf_counter() - self._began
+        evaluation = evaluate(self.folder.path, self.source.truth(), self.source.frames())
+        self.metrics = {
+            **evaluation.metrics,
+            **self.metrics,
+            "keyframes": len(self.graph.keyframes),
+            "focal_px": _focal_px(self.tracked.lens()),
+            "fps_tracking": self.frames / self.timings["tracking"],
+            "fps_total": self.frames / elapsed,
+            "peak_rss_mib": peak_rss_mib(),
+        }
+        if (card := accelerator()) is not None:
+            self.folder.update(accelerator=card[0])
+            self.metrics["peak_gpu_mib"] = card[1]
+        self.folder.write_metrics(self.metrics)
+        if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
+            self.folder.write_aligned(aligned)
+        self.folder.update(timings_s=self.timings)
+        self.folder.finish()
+        recorded = read_run(self.folder.path)
+        ate = evaluation.ate
+        data = gather_report_data(
+            recorded,
+            self.source.frames(),
+            {h.timestamp_s: h.psnr_db for h in evaluation.holdout},
+            ate.truth_in_map(len(recorded.trajectory.timestamps_s)) if ate and ate.rmse is not None else None,
+            ate.scale if ate and ate.rmse is not None else None,
+            title=self.source.name,
+            evidence=self._evidence,
+        )
+        write_report(self.folder.path, data)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Adds what the block takes to the stage's seconds in run.json."""
+        began = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - began
+            self.folder.record["timings_s"] = self.timings
+
+    # -- parts of the stages ---------------------------------------------------------------------------------
+
+    def _masks(self, map_view: MapView, appearance: Any) -> SmoothedMasks:
+        tracked, folder = self.tracked, self.folder
+        context = SmoothingContext(
+            self._final, self.graph, tracked.parts, self.config, map_view, tracked.rectifier, appearance
+        )
+        video = MaskVideo(folder.path / "masks.mp4", *tracked.parts.provider.size)
+        best = 0.0
+        with self.reporter.stage("masks", len(self._final), "frames") as bar:
+
+            def on_mask(seen: FrameMask) -> None:
+                nonlocal best
+                folder.write_mask(seen.timestamp_s, seen.over_photograph)
+                video.add(seen.timestamp_s, seen.image, seen.mask.probability)
+                shown = float(np.minimum(seen.mask.moving.mean(), 0.3)) + 1e-3 * len(seen.mask.evidence)
+                if shown > best:
+                    best = shown
+                    self._evidence = EvidenceSample(
+                        seen.timestamp_s, seen.image, seen.mask.probability, dict(seen.mask.evidence)
+                    )
+                bar.advance()
+
+            try:
+                return smooth_masks(self.source.frames(), context, on_mask)
+            finally:
+                video.close()
+
+    def _write_trajectory(self) -> None:
+        graph = self.graph
+        self.folder.write_trajectory(trajectory_of(self._final))
+        lens = self.tracked.lens()
+        camera = lens.radial if isinstance(lens, OpenCvLens) else lens
+        self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None)
+        report = graph.last_report
+        sigma = report.focal_sigma_ratio if report is not None else None
+        lost = [f for f in self._final if f.state == "interpolated"]
+        facts: dict[str, Any] = {
+            "focal_px": _focal_px(lens),
+            "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
+            "k1": camera.k1,
+            "k2": camera.k2,
+            "k3": camera.k3,
+            "found": "given" if self.config.camera.intrinsics else "from the video",
+        }
+        if isinstance(lens, OpenCvLens):
+            facts["distortion"] = list(lens.distortion)
+        self.folder.update(
+            camera=facts,
+            graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
+        )
+        if lost:
+            self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
+
+    # -- what stops it ---------------------------------------------------------------------------------------
+
+    def __enter__(self) -> RunJob:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, SlamError):
+            self.save_the_rest(str(error))
+        elif isinstance(error, KeyboardInterrupt):
+            self.save_the_rest("stopped by the user (Ctrl-C)")
+        if self._live is not None:
+            self._live.close()
+
+    def save_the_rest(self, reason: str) -> None:
+        """Write what is known and mark the run incomplete; never hides the error that brought us here."""
+        self.folder.make_room()
+        try:
+            graph = self.graph
+            if not self._final and graph.records:
+                if graph.initialised:
+                    graph.solve_all(5, 1.0)
+                self._final = final_frames(graph)
+                self._write_trajectory()
+            self.folder.note(*self.source.notes)
+            self.folder.update(timings_s=self.timings)
+            self.folder.finish("incomplete", reason)
+        except SlamError as e:
+            log.error("could not save everything: %s", e)
+
+
+def _focal_px(lens: Camera | OpenCvLens) -> float:
+    return lens.focal_px if isinstance(lens, OpenCvLens) else lens.fx_px

@@ -1,0 +1,154 @@
+"""What came of a video, read from its run folder when it is asked for."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.opencv_lens import OpenCvLens
+from ..camera.pinhole import Camera
+from ..export.claim import claim
+from ..export.files import writing
+from ..export.formats import export_run
+from ..export.point_cloud import read_cloud
+from ..export.read_run import Run, read_run
+from ..mapping.gaussians import GaussianArrays
+from ..mapping.ply import read_gaussians_ply
+from ..types import StaticCloud
+from .renders import export_splat, lens_of
+
+Array = NDArray[Any]
+SPLAT_FORMATS = ("spz", "flight", "depth")
+
+
+class Masks(Sequence[Array]):
+    """P(moving) of every frame that has a mask, in order of time, read when it is asked for."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.timestamps_s: Array = run.mask_times_s()
+
+    def __len__(self) -> int:
+        return len(self.timestamps_s)
+
+    @overload
+    def __getitem__(self, n: int) -> Array: ...
+    @overload
+    def __getitem__(self, n: slice) -> list[Array]: ...
+    def __getitem__(self, n: int | slice) -> Array | list[Array]:
+        """(h, w) float32 in 0..1, at working size."""
+        if isinstance(n, slice):
+            return [self._read(t) for t in self.timestamps_s[n]]
+        return self._read(self.timestamps_s[n])
+
+    def _read(self, timestamp_s: float) -> Array:
+        return self._run.mask(float(timestamp_s)).astype(np.float32) / 255
+
+    def __iter__(self) -> Iterator[Array]:
+        return (self._read(t) for t in self.timestamps_s)
+
+
+class Reconstruction:
+    """Trajectory, lens, masks, static cloud and splat of one video. Lengths are map units, axes OpenCV's."""
+
+    def __init__(self, path: Path, temporary: tempfile.TemporaryDirectory[str] | None = None) -> None:
+        """``path``: a run folder. ``temporary`` is kept as long as this is. Raises InputError where it is none."""
+        self._run, self._temporary = read_run(path), temporary
+
+    def __repr__(self) -> str:
+        return f"<Reconstruction of {len(self.poses)} frames in {self.path}>"
+
+    @property
+    def path(self) -> Path:
+        """The run folder."""
+        return self._run.path
+
+    @property
+    def timestamps_s(self) -> Array:
+        """(n,) float64 seconds of the frames that have a pose."""
+        return self._run.trajectory.timestamps_s
+
+    @property
+    def poses(self) -> Array:
+        """(n, 4, 4) float64 world_from_cam."""
+        return self._run.trajectory.world_from_cam
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """How each frame came by its pose: started, tracked or interpolated."""
+        return self._run.trajectory.states
+
+    @property
+    def is_keyframe(self) -> Array:
+        """(n,) bool."""
+        return self._run.trajectory.is_keyframe
+
+    @property
+    def camera(self) -> Camera | OpenCvLens:
+        """The lens over the full-size image. Raises InputError where the run was stopped before it was found."""
+        return lens_of(self._run)
+
+    @cached_property
+    def cloud(self) -> StaticCloud:
+        """The static cloud. Raises InputError where the run was stopped before it."""
+        return read_cloud(self.path / "cloud.ply")
+
+    @property
+    def masks(self) -> Masks:
+        """P(moving) of every frame."""
+        return Masks(self._run)
+
+    @cached_property
+    def gaussians(self) -> GaussianArrays | None:
+        """The splat; None where none was made."""
+        file = self.path / "gaussians.ply"
+        return read_gaussians_ply(file) if file.is_file() else None
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The figures of metrics.json."""
+        return dict(self._run.metrics)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was chosen and what went wrong, a line each."""
+        return tuple(self._run.record.get("choices", ()))
+
+    @property
+    def is_complete(self) -> bool:
+        """False where the run was stopped; ``reason`` says why."""
+        return self._run.record.get("status") == "complete"
+
+    @property
+    def reason(self) -> str | None:
+        """Why the run is not complete."""
+        reason: str | None = self._run.record.get("reason")
+        return reason
+
+    def save(self, path: str | Path) -> Path:
+        """Copy the run folder to ``path``, and stay there. Raises OutputError where that is not ours to write."""
+        target = Path(path).expanduser()
+        if target.resolve() == self.path.resolve():
+            return self.path
+        claim(target, [self.path])
+        with writing(target):
+            shutil.copytree(self.path, target, dirs_exist_ok=True)
+        self._run, self._temporary = read_run(target), None
+        return target
+
+    def export(self, kind: str, out: str | Path) -> Path:
+        """The run in another format, as ``mastd3r export --to``: tum, kitti, colmap, spz, flight or depth.
+
+        Raises InputError for a format that is not known or that the run has nothing for, and OutputError.
+        """
+        out = Path(out).expanduser()
+        if kind in SPLAT_FORMATS:
+            return export_splat(self.path, kind, out)
+        return export_run(self.path, kind, out)

@@ -1,0 +1,44 @@
+"""A submap that sees a place of another one becomes a part of it."""
+
+from __future__ import annotations
+
+import logging
+
+from ..concurrency import Future
+from ..graph.keyframe_graph import Keyframe, KeyframeGraph
+from ..graph.place_recognition import PlaceRecognition
+from ..graph.submaps import join, scale_between
+from .covisibility import CovisibilityEdges
+from .two_view import TwoViewEstimator
+
+log = logging.getLogger(__name__)
+MATCHED_AROUND = 2  # keyframes on either side of the recognised one that are matched as well
+
+
+def join_recognised(
+    graph: KeyframeGraph,
+    kf: Keyframe,
+    two_view: TwoViewEstimator,
+    edges: CovisibilityEdges,
+    places: PlaceRecognition,
+) -> bool:
+    """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
+    own = graph.submap_of[kf.id]
+    others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
+    for other in places.best(graph, kf.work, others):
+        view = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
+        if view is None:
+            continue
+        pose = view.alignment.new_from_ref
+        scale = scale_between(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
+        if scale is None:
+            continue
+        log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
+        join(graph, other.id, kf.id, pose, scale)
+        around = range(max(0, other.id - MATCHED_AROUND), min(len(graph.keyframes), other.id + MATCHED_AROUND + 1))
+        for k in around:
+            if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:
+                edges.add(graph, k, kf.id)
+        graph.solve_all(10, 2.0)
+        return True
+    return False
