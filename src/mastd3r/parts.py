@@ -98,7 +98,7 @@ def chosen_map_device(config: MappingConfig, notes: list[str]) -> str:
     check_map_options(config)
     if not config.enabled:
         return "cpu"
-    device, why = map_device(config.device)
+    device, why = map_device(config.device, config.backend)
     notes.append(f"map on {device}" + (f", chosen by auto ({why})" if why else ""))
     log.info(notes[-1])
     return device

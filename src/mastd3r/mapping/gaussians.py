@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..registry import AUTO
 from .rasterise import rasterization
 from .screen import ScreenStats
 from .sh import sh_turned, view_colors
@@ -41,6 +42,7 @@ class GaussianMap:
     colors: torch.Tensor  # (n, 3) RGB, 0..1 but not clamped: the mean over all directions
     sh_rest: torch.Tensor  # (n, K - 1, 3), see sh.view_colors; K = 1: the colour does not depend on the direction
     kf_id: torch.Tensor  # (n,) int32
+    backend: str = AUTO  # what draws it, by its name in the registry; auto: by the device of the tensors
 
     def __len__(self) -> int:
         return len(self.means)
@@ -70,13 +72,13 @@ class GaussianMap:
     def picked(self, rows: torch.Tensor) -> GaussianMap:
         """A copy of some rows, in the order given (repeats allowed), as new leaves."""
         tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}
-        return GaussianMap(**tensors, kf_id=self.kf_id[rows])
+        return replace(self, **tensors, kf_id=self.kf_id[rows])
 
     def joined(self, other: GaussianMap) -> GaussianMap:
         """These rows, then the other's, as new leaves."""
         pairs = zip(self.parameters().items(), other.parameters().values(), strict=True)
         tensors = {name: torch.cat([a.detach(), b.detach()]).requires_grad_() for (name, a), b in pairs}
-        return GaussianMap(**tensors, kf_id=torch.cat([self.kf_id, other.kf_id]))
+        return replace(self, **tensors, kf_id=torch.cat([self.kf_id, other.kf_id]))
 
     def draw(
         self,
@@ -102,6 +104,7 @@ class GaussianMap:
             near=near,
             background=background,
             stats=stats,
+            backend=self.backend,
         )
 
     def moved(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> GaussianMap:

@@ -76,6 +76,7 @@ class Mapper:
             self._map = GaussianMap.from_arrays(start, device)
         else:
             self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree)
+        self._map.backend = config.backend
         self._adam = RowAdam(self._map.parameters())
         self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)

@@ -1,4 +1,4 @@
-"""The one rasteriser signature; the device of ``means`` chooses the backend (CPU: numba, CUDA: gsplat)."""
+"""The one rasteriser signature; the backend is named, or follows from the device of ``means``."""
 
 from __future__ import annotations
 
@@ -7,8 +7,12 @@ import subprocess
 import torch
 
 from ..config import MapDeviceKind
-from ..errors import InputError, MissingPackage
+from ..errors import ConfigError, InputError, MissingPackage
+from ..registry import AUTO, MAP_BACKENDS
 from .screen import ScreenStats
+
+
+OF_DEVICE = {"cpu": "numba", "cuda": "gsplat"}  # the backend that draws tensors of a device
 
 
 def torch_device() -> str:
@@ -23,12 +27,17 @@ def accelerator() -> tuple[str, float] | None:
     return torch.cuda.get_device_name(), torch.cuda.max_memory_allocated() / 2**20
 
 
-def map_device(asked: MapDeviceKind) -> tuple[str, str]:
-    """Where the map lives, and why ``auto`` chose it; no reason where the user did.
+def map_device(asked: MapDeviceKind, backend: str = AUTO) -> tuple[str, str]:
+    """Where the map lives, and why ``auto`` chose it; no reason where the user did. A named backend says where.
 
     The accelerator is believed once gsplat has drawn on it (it compiles its kernels then, which takes minutes,
     once a machine). Raises InputError where it was asked for by name and cannot be used.
     """
+    if backend != AUTO:
+        where: str = MAP_BACKENDS.create(backend).device
+        if asked not in (AUTO, where):
+            raise ConfigError(f"mapping.device: expected auto or {where}, which {backend} draws on, got {asked}")
+        return where, ""
     if asked == "cpu":
         return asked, ""
     lack = _lack_of_accelerator()
@@ -67,29 +76,25 @@ def rasterization(
     eps2d: float = 0.3,
     background: torch.Tensor | None = None,
     stats: ScreenStats | None = None,
+    backend: str = AUTO,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Draw 3-D Gaussians; differentiable in the Gaussians and the view matrix.
 
     means (N,3) world; quats (N,4) wxyz, any length; scales (N,3) standard deviations; opacities (N,) 0..1;
     colors (N,3); viewmats (4,4) cam_from_world; Ks (3,3) for pixels whose integers are their centres;
     near: Gaussians whose centre is nearer are not drawn; eps2d: px² added to the 2-D variances;
-    background (3,) colour behind everything, None = black. ``stats`` receives what densification needs.
+    background (3,) colour behind everything, None = black. ``stats`` receives what densification needs;
+    ``backend``: a name of the registry.
 
     Returns color (H,W,3), depth (H,W) = sum of weight · z, NOT divided by alpha, alpha (H,W) = sum of weight.
     Raises InputError for wrong shapes or an unknown device, MissingPackage for CUDA without gsplat.
     """
     _check(means, quats, scales, opacities, colors, viewmats, Ks, width, height)
     arguments = (means, quats, scales, opacities, colors, viewmats, Ks, width, height, near, eps2d, stats)
-    if means.device.type == "cpu":
-        from .rasterise_cpu import rasterise_cpu
-
-        color, depth, alpha = rasterise_cpu(*arguments)
-    elif means.device.type == "cuda":
-        from .rasterise_gsplat import rasterise_gsplat
-
-        color, depth, alpha = rasterise_gsplat(*arguments)
-    else:
+    name = backend if backend != AUTO else OF_DEVICE.get(means.device.type)
+    if name is None:
         raise InputError(f"rasterization: expected tensors on cpu or cuda, got {means.device}")
+    color, depth, alpha = MAP_BACKENDS.create(name).rasterise(*arguments)
     if background is not None:
         color = color + (1 - alpha)[..., None] * background
     return color, depth, alpha

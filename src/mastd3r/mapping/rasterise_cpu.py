@@ -94,3 +94,15 @@ def rasterise_cpu(
     arrays = (means.float(), quats.float(), scales.float(), opacities.float(), colors.float(), view.double())
     image, alpha = _Rasterise.apply(*arrays, shifted, (width, height), near, eps2d, stats)
     return image[..., :3], image[..., 3], alpha
+
+
+class NumbaBackend:
+    """Our rasteriser, as the registry names it."""
+
+    device = "cpu"
+    rasterise = staticmethod(rasterise_cpu)
+
+
+def build() -> NumbaBackend:
+    """The backend."""
+    return NumbaBackend()

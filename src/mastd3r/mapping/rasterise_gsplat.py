@@ -53,3 +53,15 @@ def rasterise_gsplat(
         if info["means2d"].requires_grad:
             info["means2d"].register_hook(lambda grad: setattr(stats, "mean_grad_px", grad[0]))
     return image[0, ..., :3], image[0, ..., 3], alpha[0, ..., 0]
+
+
+class GsplatBackend:
+    """gsplat, as the registry names it."""
+
+    device = "cuda"
+    rasterise = staticmethod(rasterise_gsplat)
+
+
+def build() -> GsplatBackend:
+    """The backend; gsplat itself is loaded when it draws."""
+    return GsplatBackend()
