@@ -18,19 +18,20 @@ import sys
 import time
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import numpy as np
 
 from mastd3r.concurrency import one_blas_thread
-from mastd3r.config import Config, CorrectionKind
+from mastd3r.config import Config
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.geometry.se3 import inverse
 from mastd3r.parts import Parts
 from mastd3r.pointmap.geometric import working_size
+from mastd3r.registry import ALIGNMENT
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.types import Source, Trajectory
@@ -93,7 +94,7 @@ def main() -> None:
     entries: dict[str, Any] = known.get("entries", {}) if known.get("about") == about else {}
     for seed in range(args.seeds):
         for variant in VARIANTS:
-            for correction in get_args(CorrectionKind):
+            for correction in ALIGNMENT.choices:
                 key = f"{variant} {correction} {seed}"
                 if key in entries:
                     continue

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from mastd3r.config import CorrectionKind
+from mastd3r.registry import ALIGNMENT
 
 ROWS = {"ours": "ours", "printed": "as printed"}
 
@@ -21,7 +21,7 @@ def corrections(path: Path) -> list[str]:
     about, errors = data["about"], data["about"]["errors"]
     entries: list[dict[str, Any]] = list(data["entries"].values())
     seeds = sorted({e["seed"] for e in entries})
-    names = get_args(CorrectionKind)
+    names = ALIGNMENT.choices
     lines = [
         "",
         "## Corrections (Table IV) under a network's errors",

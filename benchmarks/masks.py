@@ -43,17 +43,23 @@ STILL = ("kitchen", "lobby")
 LOOKED_AT = ("jam", "cafe", "bedroom")
 VARIANTS: dict[str, tuple[str, ...]] = {
     "ours": (),
-    "without motion": ("use_motion=false",),
-    "without semantics in the fusion": ("use_semantic=false",),
-    "without time": ("use_time=false",),
-    "without looks (head)": ("use_head=false",),
-    "without frames after": ("use_future=false",),
-    "without support": ("use_support=false",),
-    "without regions": ("use_regions=false",),
-    "the tracking's gaps only": ("second_gaps=[1, 4]",),
+    "without motion": ("motion.enabled=false",),
+    "without semantics in the fusion": ("semantic.enabled=false",),
+    "without time": ("temporal.enabled=false",),
+    "without appearance": ("appearance.enabled=false",),
+    "without frames after": ("temporal.backward=false",),
+    "without support": ("support.enabled=false",),
+    "without regions": ("refinement.enabled=false",),
+    "the tracking's gaps only": ("temporal.smoother_gaps=[1, 4]",),
     "paper, eq. (1)-(4)": ("variant=paper",),
 }
-PERFECT = ("semantic_share=0.0", "semantic_gain=1.0", "semantic_floor=0.001", "semantic_missed=0.001", "use_head=false")
+PERFECT = (
+    "semantic.evidence_share=0.0",
+    "semantic.gain=1.0",
+    "semantic.floor=0.001",
+    "semantic.missed=0.001",
+    "appearance.enabled=false",
+)
 STARTS = range(5)
 COST_FRAMES = 200
 ABLATED = 48  # frames in the middle of each sequence that variants are compared on
@@ -89,7 +95,7 @@ class Task:
 
     def config(self) -> Config:
         """All options."""
-        config = replace(Config(), semantics=self.semantics)  # type: ignore[arg-type]
+        config = replace(Config(), semantics=self.semantics)
         config = replace(config, source=replace(config.source, start=self.start, end=self.end))
         return _with_masks(config, self.dynamics)
 
@@ -139,7 +145,7 @@ class Results:
 
 
 class Tracked:
-    """One sequence, tracked and solved once, for as many second passes as are wanted."""
+    """One sequence, tracked and solved once, for as many smoothing passes as are wanted."""
 
     def __init__(self, data: Path, task: Task) -> None:
         self.config = config = task.config()
@@ -178,7 +184,7 @@ class Tracked:
         each: Callable[[FrameMask], None] | None = None,
         frames: tuple[int, int] | None = None,
     ) -> dict[str, Any]:
-        """Figures of the second pass under other options of the mask; ``frames``: from, and one past the last."""
+        """Figures of the smoothing pass under other options of the mask; ``frames``: from, and one past the last."""
         config = _with_masks(self.config, overrides)
         config = replace(config, mapping=replace(config.mapping, enabled=False))
         truth = self.source.truth()
@@ -193,7 +199,9 @@ class Tracked:
                 each(seen)
 
         map_view = MapView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
-        look = Look(self.final, self.slam.graph, self.slam.parts, config, map_view, head=self.slam.belief.head.copy())
+        known = self.slam.belief.appearance
+        learned = None if known is None else known.copy()
+        look = Look(self.final, self.slam.graph, self.slam.parts, config, map_view, appearance=learned)
         smooth_masks(islice(self.source.frames(), *(frames or (None,))), look, on_mask)
         found = mask_error(pairs)
         return {"iou": found.iou, "false_positives": found.false_positive_ratio, "moving": found.called_moving_ratio}

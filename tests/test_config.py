@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
-from mastd3r.config import Config, SourceConfig, config_from_dict, config_from_yaml, config_to_yaml, with_override
+import mastd3r.config
+from mastd3r.config import (
+    PRESETS,
+    RENAMED,
+    Config,
+    SourceConfig,
+    config_from_dict,
+    config_from_yaml,
+    config_to_yaml,
+    preset,
+    with_override,
+)
 from mastd3r.errors import ConfigError
+from mastd3r.registry import ALIGNMENT, DYNAMICS, FEATURES, MAP_BACKENDS, PLACES, POINTMAPS, SEMANTICS, Registry
 
 
 def test_defaults_survive_a_round_trip(tmp_path: Path) -> None:
@@ -62,7 +76,31 @@ def test_overrides_leave_the_rest_alone() -> None:
         ({"mapping": {"lambda_uncertainty": False}}, "mapping.lambda_uncertainty: expected float, got False"),
         ({"mapping": {"enabled": 1}}, "config mapping.enabled: expected bool, got 1"),
         ({"mapping": {"loss": "l2"}}, "expected one of plain, mask, uncertainty, full, got 'l2'"),
-        ({"correction": ["fine"]}, "expected one of none, coarse, fine, coarse-to-fine, got ['fine']"),
+        (
+            {"correction": ["fine"]},
+            "config correction: expected one of none, coarse, fine, coarse-to-fine, got ['fine']",
+        ),
+        (
+            {"pointmaps": "mast3"},
+            "config pointmaps: expected one of auto, geometric, mast3r, depth, got 'mast3'; perhaps",
+        ),
+        ({"dynamics": {"variant": 3}}, "config dynamics.variant: expected one of ours, paper, none, got 3"),
+        (
+            {"dynamics": {"motion": {"flow_nois": 1}}},
+            "key dynamics.motion.flow_nois; perhaps you meant dynamics.motion.f",
+        ),
+        ({"dynamics": {"motion": True}}, "config dynamics.motion: expected key: value pairs, got True"),
+        ({"dynamics": {"motion": {"enabled": 1}}}, "config dynamics.motion.enabled: expected bool, got 1"),
+        ({"dynamics": {"use_hea": True}}, "unknown key dynamics.use_hea; known: variant"),
+        ({"dynamics": {"use_head": 3}}, "config dynamics.appearance.enabled: expected bool, got 3"),
+        (
+            {"dynamics": {"appearance": 3, "use_head": True}},
+            "config dynamics.appearance: expected key: value pairs, got 3",
+        ),
+        (
+            {"dynamics": {"use_head": True, "appearance": {"enabled": True}}},
+            "config: expected dynamics.appearance.enabled or its old name dynamics.use_head, got both",
+        ),
         ({"source": {"end": "last"}}, "config source.end: expected int, got 'last'"),
         ({"camera": {"intrinsics": 300}}, "config camera.intrinsics: expected a list, got 300"),
         ({"camera": {"intrinsics": ["f"]}}, "config camera.intrinsics: expected float, got 'f'"),
@@ -85,6 +123,7 @@ def test_what_is_refused(data: dict[Any, Any], words: str) -> None:
         ("stride=2", "unknown key stride"),
         ("=2", "unknown key"),
         ("seed.x=2", "config seed: expected int, got {'x': 2}"),
+        ("dynamics.temporal.memry=1", "perhaps you meant dynamics.temporal.memory"),
     ],
 )
 def test_overrides_that_are_refused(text: str, words: str) -> None:
@@ -111,3 +150,110 @@ def test_files_that_are_refused(tmp_path: Path, content: bytes | None, words: st
         config_from_yaml(file)
     assert words in str(e.value) and str(file) in str(e.value)
     assert "\n" not in str(e.value)
+
+
+def leaf(config: Any, dotted: str) -> Any:
+    """The value of a dotted key."""
+    for name in dotted.split("."):
+        config = getattr(config, name)
+    return config
+
+
+# -- sections in sections, names of before ----------------------------------------------------------------------------
+
+
+def test_sections_of_sections_are_read_from_yaml_and_from_words(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text("dynamics:\n  temporal:\n    smoother_gaps: [1, 4]\n  motion: {enabled: false}\n")
+    config = with_override(config_from_yaml(file), "dynamics.appearance.share=1")
+    d = config.dynamics
+    assert (d.temporal.smoother_gaps, d.motion.enabled, d.appearance.share) == ((1, 4), False, 1.0)
+    assert d.temporal.filter_gaps == Config().dynamics.temporal.filter_gaps
+    assert config_from_dict(yaml.safe_load(config_to_yaml(config))) == config
+
+
+@pytest.mark.parametrize("old", sorted(RENAMED))
+def test_an_old_name_sets_the_new_option_and_says_so(
+    old: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    new, before = RENAMED[old], leaf(Config(), RENAMED[old])
+    value: Any = [2, 3] if isinstance(before, tuple) else not before if isinstance(before, bool) else before + 1
+    section, key = old.split(".")
+    file = tmp_path / "c.yaml"
+    file.write_text(yaml.safe_dump({section: {key: value}}))
+    mastd3r.config._say_renamed.cache_clear()
+    read = config_from_yaml(file)
+    assert read == with_override(Config(), f"{old}={value}") == with_override(Config(), f"{new}={value}")
+    assert leaf(read, new) == (tuple(value) if isinstance(value, list) else value) and read != Config()
+    assert caplog.messages == [f"config: {old} is now {new}; the old name goes with the next version"]
+
+
+def test_old_and_new_names_stand_beside_each_other() -> None:
+    config = config_from_dict(
+        {"dynamics": {"use_head": False, "appearance": {"share": 0.7}, "head_limit": 2, "base_rate": 0.2}}
+    )
+    a = config.dynamics.appearance
+    assert (a.enabled, a.share, a.max_log_odds, config.dynamics.base_rate) == (False, 0.7, 2.0, 0.2)
+
+
+# -- parts by name, presets -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("registry", "key"),
+    [
+        (POINTMAPS, "pointmaps"),
+        (FEATURES, "features"),
+        (SEMANTICS, "semantics"),
+        (PLACES, "places"),
+        (ALIGNMENT, "correction"),
+        (DYNAMICS, "dynamics.variant"),
+        (MAP_BACKENDS, "mapping.backend"),
+    ],
+)
+def test_a_part_from_outside_can_be_chosen_while_it_is_there(registry: Registry, key: str) -> None:
+    assert registry.option == key and leaf(Config(), key) in registry.choices
+    with registry.registered("mine", lambda *_: None):
+        assert leaf(with_override(Config(), f"{key}=mine"), key) == "mine"
+    with pytest.raises(ConfigError, match=f"^config {key}: expected one of "):
+        with_override(Config(), f"{key}=mine")
+
+
+def test_the_paper_preset_takes_everything_as_printed() -> None:
+    assert list(PRESETS) == ["paper"]
+    paper, expected = preset("paper"), Config()
+    for item in (
+        "dynamics.variant=paper",
+        "alignment.as_printed=true",
+        "mapping.paper_loss=true",
+        "mapping.hard_weight=true",
+    ):
+        expected = with_override(expected, item)
+    assert paper == expected
+    for key in options_as_printed():
+        assert leaf(paper, key) != leaf(Config(), key), key
+    with pytest.raises(ConfigError, match="preset: expected one of paper, got 'papr'"):
+        preset("papr")
+
+
+def options_as_printed() -> list[str]:
+    """Dotted keys of the options of sections whose comment says "as printed"."""
+    found = []
+    for section in dataclasses.fields(Config):
+        value = getattr(Config(), section.name)
+        if dataclasses.is_dataclass(value):
+            source = inspect.getsource(type(value))
+            names = [f.name for f in dataclasses.fields(value)]
+            found += [
+                f"{section.name}.{n}" for n in names if re.search(rf"^    {n}: [^#]*#[^#]*as printed", source, re.M)
+            ]
+    return found
+
+
+def test_the_options_as_printed_are_found_by_their_comments() -> None:
+    assert options_as_printed() == [
+        "alignment.as_printed",
+        "dynamics.variant",
+        "mapping.hard_weight",
+        "mapping.paper_loss",
+    ]

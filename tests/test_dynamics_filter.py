@@ -10,8 +10,11 @@ import pytest
 
 from mastd3r.camera.pinhole import Camera
 from mastd3r.dynamics import DynamicMask, DynamicsConfig, DynamicsInput, LogOddsFilter
+from mastd3r.dynamics.config import DepthConfig, MotionConfig, TemporalConfig
 from mastd3r.errors import InputError
 from mastd3r.geometry.se3 import se3_exp
+from mastd3r.protocols import DynamicsFilter, DynamicsModel, DynamicsSmoother
+from mastd3r.registry import DYNAMICS
 
 W, H = 320, 240
 CAMERA = Camera.centred(260.0, W, H)
@@ -45,7 +48,7 @@ def frame(i: int, speed_px: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return gray, world_from_cam, moving
 
 
-def given(i: int, gray: np.ndarray, pose: np.ndarray, **more: object) -> DynamicsInput:
+def input_of(i: int, gray: np.ndarray, pose: np.ndarray, **more: object) -> DynamicsInput:
     inv_depth = np.full((H, W), WALL, np.float32)
     base = DynamicsInput(i, i / 30, gray, CAMERA, pose, inv_depth, np.full((H, W), 0.02, np.float32))
     return replace(base, **more)  # type: ignore[arg-type]
@@ -53,12 +56,12 @@ def given(i: int, gray: np.ndarray, pose: np.ndarray, **more: object) -> Dynamic
 
 def play(config: DynamicsConfig, n: int = 10, speed_px: float = 3.0, thing: bool = True, **more: object) -> list:
     """[(mask, truth)] of a short run. ``thing`` False: the empty room."""
-    belief, out = LogOddsFilter(config, W, H), []
+    mask_filter, out = DYNAMICS.create(config.variant, config).filter(W, H), []
     for i in range(n):
         gray, pose, moving = frame(i, speed_px if thing else 1e6)
         semantic = more.get("semantic")
-        belief.prior(gray, semantic if isinstance(semantic, np.ndarray) else None)
-        out.append((belief.update(given(i, gray, pose, **more)), moving))
+        mask_filter.prior(gray, semantic if isinstance(semantic, np.ndarray) else None)
+        out.append((mask_filter.update(input_of(i, gray, pose, **more)), moving))
     return out
 
 
@@ -86,19 +89,19 @@ def test_unknown_depth_degrades_gracefully() -> None:
 
 def test_first_frame_is_the_base_rate() -> None:
     gray, pose, _ = frame(0, 3.0)
-    belief = LogOddsFilter(DynamicsConfig(), W, H)
-    np.testing.assert_allclose(belief.prior(gray, None), 0.1, atol=1e-5)
-    mask = belief.update(given(0, gray, pose))
+    mask_filter = LogOddsFilter(DynamicsConfig(), W, H)
+    np.testing.assert_allclose(mask_filter.prior(gray, None), 0.1, atol=1e-5)
+    mask = mask_filter.update(input_of(0, gray, pose))
     np.testing.assert_allclose(mask.probability, 0.1, atol=1e-5)
     assert not mask.moving.any()
 
 
 def test_prior_of_the_next_frame_follows_the_thing() -> None:
-    belief = LogOddsFilter(DynamicsConfig(), W, H)
+    mask_filter = LogOddsFilter(DynamicsConfig(), W, H)
     for i in range(8):
         gray, pose, moving = frame(i, 3.0)
-        before = belief.prior(gray, None)
-        belief.update(given(i, gray, pose))
+        before = mask_filter.prior(gray, None)
+        mask_filter.update(input_of(i, gray, pose))
     assert before[moving].mean() > 0.6
     assert before[~moving].mean() < 0.15
 
@@ -118,41 +121,41 @@ def test_own_depth_finds_what_stands_still() -> None:
     """A thing that came while nobody looked: no motion, but nearer than the map says."""
     gray, _, truth = frame(0, 0.0)
     own = np.where(truth, 1.0, WALL).astype(np.float32)
-    for use_depth in (True, False):
-        belief = LogOddsFilter(DynamicsConfig(use_depth=use_depth), W, H)
+    for enabled in (True, False):
+        mask_filter = LogOddsFilter(DynamicsConfig(depth=DepthConfig(enabled=enabled)), W, H)
         for i in range(6):
-            mask = belief.update(given(i, gray, np.eye(4), own_inv_depth=own))
+            mask = mask_filter.update(input_of(i, gray, np.eye(4), own_inv_depth=own))
         found = float((mask.moving & truth).sum() / truth.sum())
-        assert (found > 0.8 and (mask.moving & ~truth).mean() < 0.02) if use_depth else found == 0
+        assert (found > 0.8 and (mask.moving & ~truth).mean() < 0.02) if enabled else found == 0
 
 
 def test_without_motion_nothing_is_found() -> None:
-    assert not play(DynamicsConfig(use_motion=False))[-1][0].moving.any()
+    assert not play(DynamicsConfig(motion=MotionConfig(enabled=False)))[-1][0].moving.any()
 
 
-def test_the_belief_remembers_a_thing_that_stops() -> None:
+def test_the_filter_remembers_a_thing_that_stops() -> None:
     """The frames before it stopped are beyond the only gap: with time switched off nothing is left of them."""
     shown = []
-    for use_time in (True, False):
-        belief = LogOddsFilter(DynamicsConfig(use_time=use_time, gaps=(1,)), W, H)
+    for enabled in (True, False):
+        mask_filter = LogOddsFilter(DynamicsConfig(temporal=TemporalConfig(enabled=enabled, filter_gaps=(1,))), W, H)
         for i in range(9):
             gray, pose, moving = frame(i, 3.0)
             if i == 8:  # the thing stands where it stood
                 gray, pose, moving = frame(7, 3.0)
-            mask = belief.update(given(i, gray, pose))
+            mask = mask_filter.update(input_of(i, gray, pose))
         shown.append(float(mask.probability[moving].mean()))
     assert shown[0] > shown[1] + 0.2
 
 
 def test_static_camera_needs_no_parallax() -> None:
-    belief = LogOddsFilter(DynamicsConfig(), W, H)
+    mask_filter = LogOddsFilter(DynamicsConfig(), W, H)
     for i in range(8):
         gray, _, moving = frame(0, 0.0)
         shift = np.float32([[1, 0, 60 + 3 * i], [0, 1, 70]])
         moving = cv2.warpAffine(np.full(THING.shape, 255, np.uint8), shift, (W, H)) > 127
         empty = frame(0, 1e6)[0]
         gray = np.where(moving, cv2.warpAffine(THING, shift, (W, H)), empty)
-        mask = belief.update(given(i, gray, np.eye(4)))
+        mask = mask_filter.update(input_of(i, gray, np.eye(4)))
     assert iou(mask, moving) > 0.6
 
 
@@ -173,19 +176,50 @@ def test_variants() -> None:
     np.testing.assert_array_equal(paper.moving, paper.probability > 0.5)
 
 
+@pytest.mark.parametrize("variant", ["ours", "paper", "none"])
+def test_every_variant_is_a_model_with_a_filter_and_a_smoother(variant: str) -> None:
+    model: DynamicsModel = DYNAMICS.create(variant, DynamicsConfig(variant=variant))
+    assert model.needs_features == (variant == "ours")
+    gray, pose, _ = frame(0, 3.0)
+    mask_filter: DynamicsFilter = model.filter(W, H)
+    smoother: DynamicsSmoother = model.smoother(W, H, mask_filter.appearance)
+    assert mask_filter.prior(gray).shape == (H, W) == mask_filter.update(input_of(0, gray, pose)).moving.shape
+    pairs = [(input_of(i, *frame(i, 3.0)[:2]), i) for i in range(3)]
+    assert [(mask.probability.shape, beside) for mask, beside in smoother.masks(pairs)] == [
+        ((H, W), i) for i in (0, 1, 2)
+    ]
+    wrong = np.zeros((10, 10), np.uint8)
+    with pytest.raises(InputError, match="expected gray of 320x240"):
+        mask_filter.prior(wrong)
+    with pytest.raises(InputError, match="expected gray of 320x240"):
+        list(smoother.masks([(replace(pairs[0][0], gray=wrong), 0)]))
+
+
+def test_the_paper_s_masks_after_tracking_take_a_map_that_shows_nothing_for_less() -> None:
+    gray, pose, _ = frame(0, 3.0)
+    own = np.full((H, W), WALL, np.float32)
+    own[60:160, 100:180] = 5.0
+    one = input_of(0, gray, pose, own_inv_depth=own, semantic=np.zeros((H, W), np.float32))
+    model: DynamicsModel = DYNAMICS.create("paper", DynamicsConfig(variant="paper"))
+    [(smoothed, _)] = model.smoother(W, H).masks([(one, None)])
+    marked = smoothed.evidence["anomaly"] > 0
+    assert marked.any()
+    assert (smoothed.probability[marked] > model.filter(W, H).update(one).probability[marked]).all()
+
+
 def test_tracking_believes_a_map_that_shows_nothing() -> None:
-    """Only the second pass doubts it: whatever is doubted here is lost to the pose."""
+    """Only the smoothing pass may overrule it: whatever is called moving here is lost to the pose."""
     config, nothing = DynamicsConfig(), np.zeros((H, W), np.float32)
-    assert config.semantic_missed > config.semantic_floor
-    surest = (config.semantic_floor / (1 - config.semantic_floor)) ** config.semantic_gain
+    assert config.semantic.missed > config.semantic.floor
+    surest = (config.semantic.floor / (1 - config.semantic.floor)) ** config.semantic.gain
     prior = LogOddsFilter(config, W, H).prior(frame(0, 3.0)[0], nothing)
     np.testing.assert_allclose(prior, surest / (1 + surest), rtol=1e-4)
 
 
 def test_wrong_size_is_one_clear_line() -> None:
-    belief = LogOddsFilter(DynamicsConfig(), W, H)
+    mask_filter = LogOddsFilter(DynamicsConfig(), W, H)
     with pytest.raises(InputError, match="expected gray of 320x240"):
-        belief.prior(np.zeros((10, 10), np.uint8), None)
+        mask_filter.prior(np.zeros((10, 10), np.uint8), None)
     gray, pose, _ = frame(0, 3.0)
     with pytest.raises(InputError, match="own_inv_depth"):
-        belief.update(given(0, gray, pose, own_inv_depth=np.zeros((4, 4), np.float32)))
+        mask_filter.update(input_of(0, gray, pose, own_inv_depth=np.zeros((4, 4), np.float32)))

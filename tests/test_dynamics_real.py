@@ -41,7 +41,7 @@ def play(config: DynamicsConfig, walk: bool, maps: bool, start: int, count: int)
     seq = DATA / ("kitchen_walk" if walk else "kitchen")
     truth = np.array([[float(v) for v in r] for r in rows(DATA / "kitchen/groundtruth.txt")])
     depth = dict(rows(DATA / "kitchen/depth.txt"))  # type: ignore[arg-type]
-    belief, ious, alone, false = LogOddsFilter(config, W, H), [], [], []
+    mask_filter, ious, alone, false = LogOddsFilter(config, W, H), [], [], []
     for i, (stamp, name) in enumerate(rows(seq / "rgb.txt")[start : start + count]):
         pose = np.eye(4)
         row = truth[np.abs(truth[:, 0] - float(stamp)).argmin()]
@@ -51,8 +51,10 @@ def play(config: DynamicsConfig, walk: bool, maps: bool, start: int, count: int)
         semantic = None
         if maps:
             semantic = cv2.resize(cv2.imread(str(seq / f"semantic/{stamp}.png"), 0), (W, H)).astype(np.float32) / 255
-        belief.prior(gray, semantic)
-        mask = belief.update(DynamicsInput(i, float(stamp), gray, lens.resized(W, H), pose, inv, sigma, None, semantic))
+        mask_filter.prior(gray, semantic)
+        mask = mask_filter.update(
+            DynamicsInput(i, float(stamp), gray, lens.resized(W, H), pose, inv, sigma, None, semantic)
+        )
         moving = np.zeros((H, W), bool)
         if walk:
             moving = cv2.resize(cv2.imread(str(seq / f"mask/{stamp}.png"), 0), (W, H)) > 127

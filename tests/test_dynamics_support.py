@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
-from test_dynamics_belief import H, W, frame, given
 
 from mastd3r.dynamics import DynamicsConfig
+from mastd3r.dynamics.config import SemanticConfig, SupportConfig
 from mastd3r.dynamics.depth_support import CELL_PX, SURE_LEAP, floating_log_ratio, leap_to_border
 from mastd3r.dynamics.refinement import EdgeRefinement
+from test_dynamics_filter import H, W, frame, input_of
 
 ROWS, COLS = 30, 40
 
@@ -50,18 +49,18 @@ def test_a_depth_that_nobody_is_sure_of_does_not_float() -> None:
 
 def test_the_log_ratio_is_bounded_and_of_the_image() -> None:
     gray, pose, _ = frame(0, 3.0)
-    told, config = given(0, gray, pose), DynamicsConfig(floating_gain=1.5)
-    ratio = floating_log_ratio(told, config)
+    config = DynamicsConfig(support=SupportConfig(floating_gain=1.5))
+    ratio = floating_log_ratio(input_of(0, gray, pose), config)
     assert ratio.shape == (H, W) and ratio.min() >= 0 and ratio.max() <= 1.5
 
 
-def test_a_map_that_shows_nothing_near_is_doubted_and_its_outlines_are_not() -> None:
-    outline = EdgeRefinement(DynamicsConfig(), W, H)
+def test_a_map_that_shows_nothing_near_may_be_wrong_and_its_edges_are_right() -> None:
+    refinement = EdgeRefinement(DynamicsConfig(), W, H)
     semantic = np.zeros((H, W), np.float32)
     semantic[:, : W // 4] = 1
-    told = outline.semantic_log_odds(semantic)
-    assert (told[:, : W // 5] > 2.5).all()
-    assert (told[:, W // 4 + 1] < -2.5).all()
-    assert (told[:, -W // 4 :] > -1.5).all() and (told[:, -W // 4 :] < 0).all()
-    old = EdgeRefinement(replace(DynamicsConfig(), semantic_missed=0.02), W, H).semantic_log_odds(semantic)
-    assert (old[:, -W // 4 :] < -2.5).all()
+    log_odds = refinement.semantic_log_odds(semantic)
+    assert (log_odds[:, : W // 5] > 2.5).all()
+    assert (log_odds[:, W // 4 + 1] < -2.5).all()
+    assert (log_odds[:, -W // 4 :] > -1.5).all() and (log_odds[:, -W // 4 :] < 0).all()
+    believed = EdgeRefinement(DynamicsConfig(semantic=SemanticConfig(missed=0.02)), W, H).semantic_log_odds(semantic)
+    assert (believed[:, -W // 4 :] < -2.5).all()

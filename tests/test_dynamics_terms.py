@@ -116,23 +116,23 @@ def test_pose_jacobian_is_the_derivative_of_the_projection() -> None:
 def test_depth_in_front_of_the_background_moves_and_equal_depth_does_not() -> None:
     background = np.full((1, 4), 0.5, np.float32)
     own = np.array([[0.5, 1.0, 0.25, 0.0]], np.float32)
-    given = DynamicsInput(
+    frame = DynamicsInput(
         0, 0.0, np.zeros((1, 4), np.uint8), CAMERA, np.eye(4), background, np.full((1, 4), 0.01, np.float32), own
     )
-    ratio = depth_log_ratio(given, CONFIG)[0]
+    ratio = depth_log_ratio(frame, CONFIG)[0]
     assert ratio[0] < -1
     assert ratio[1] > 2
     assert ratio[1] > ratio[2] > 0  # behind: less sure than in front
     assert ratio[3] == 0  # no measurement
-    wide = DynamicsInput(0, 0.0, given.gray, CAMERA, np.eye(4), background, np.full((1, 4), np.inf), own)
+    wide = DynamicsInput(0, 0.0, frame.gray, CAMERA, np.eye(4), background, np.full((1, 4), np.inf), own)
     assert (depth_log_ratio(wide, CONFIG) == 0).all()
 
 
 def test_mismatch_is_near_one_for_noise_and_large_for_another_image() -> None:
     rng = np.random.default_rng(2)
     image = cv2.GaussianBlur(rng.uniform(0, 255, (60, 80)).astype(np.float32), (0, 0), 2)
-    variance = photo_variance(texture_information(image.astype(np.uint8), 7, CONFIG.texture_noise), CONFIG)
-    noisy = image + CONFIG.photo_noise * rng.standard_normal(image.shape).astype(np.float32)
+    variance = photo_variance(texture_information(image.astype(np.uint8), 7, CONFIG.motion.texture_noise), CONFIG)
+    noisy = image + CONFIG.photometric.noise * rng.standard_normal(image.shape).astype(np.float32)
     assert np.median(mismatch(image, noisy, variance)) < 1.3
     assert np.median(mismatch(image, image + 40, variance)) > 8
 
@@ -160,7 +160,7 @@ def test_guided_line_recovers_an_affine_image_exactly() -> None:
     np.testing.assert_allclose(a * guide + b, 0.02 * guide - 1, atol=0.01)
 
 
-def test_doubt_is_one_where_the_noise_is_as_claimed_and_grows_with_its_square() -> None:
+def test_noise_inflation_is_one_where_the_noise_is_as_claimed_and_grows_with_its_square() -> None:
     rng = np.random.default_rng(4)
     cov = np.zeros((96, 128, 3), np.float32) + np.array([0.3, 0.1, 0.2], np.float32)
     root = np.linalg.cholesky(np.array([[0.3, 0.1], [0.1, 0.2]]))
@@ -169,17 +169,17 @@ def test_doubt_is_one_where_the_noise_is_as_claimed_and_grows_with_its_square() 
     assert noise_inflation(residual, cov, everywhere) < 1.2
     assert noise_inflation(3 * residual, cov, everywhere) == pytest.approx(9, rel=0.2)
     few = residual.copy()
-    few[:20] += 30  # a fifth of the image moves: no reason to doubt the rest
+    few[:20] += 30  # a fifth of the image moves: no reason to weaken the rest
     assert noise_inflation(few, cov, everywhere) < 2.0
     assert noise_inflation(3 * residual, cov, 0 * everywhere) == 1.0
 
 
 def test_evidence_of_a_wrong_pose_is_weak() -> None:
-    """The whole image disagrees with the pose: with doubt nothing is called moving, without it much is."""
+    """The whole image disagrees with the pose: with noise inflation nothing is called moving, without it much is."""
     rng = np.random.default_rng(1)
     cov = np.full((96, 128, 3), 0.0, np.float32) + np.array([0.1, 0.0, 0.1], np.float32)
     residual = (rng.normal(size=(96, 128, 2)) * 3).astype(np.float32)
     plain = motion_log_ratio(residual, cov, CONFIG)
     factor = noise_inflation(residual, cov, np.ones((96, 128), np.float32))
-    doubted = motion_log_ratio(residual, cov * np.float32(factor), CONFIG)
-    assert (plain > 1).mean() > 0.8 and (doubted > 1).mean() < 0.2
+    inflated = motion_log_ratio(residual, cov * np.float32(factor), CONFIG)
+    assert (plain > 1).mean() > 0.8 and (inflated > 1).mean() < 0.2

@@ -19,9 +19,10 @@ from mastd3r.camera.rectification import Rectifier, rectifier_for
 from mastd3r.cli.main import main
 from mastd3r.config import SourceConfig
 from mastd3r.dynamics.data import DynamicMask, DynamicsInput
+from mastd3r.dynamics.ours import LogOddsModel
 from mastd3r.errors import ConfigError
 from mastd3r.export.report import ReportData, report_html
-from mastd3r.offline import smoothing as smooth_masks
+from mastd3r.registry import DYNAMICS
 from mastd3r.sources import open_source, synthetic
 from mastd3r.sources.rectified import RectifiedSource
 from mastd3r.types import Frame, Trajectory
@@ -317,9 +318,7 @@ def test_a_calibrated_bent_lens_is_as_good_as_a_straight_one(track: Callable[...
     assert "225.0\n  - 220.5" in (run / "config.yaml").read_text()  # what was given, not what was made of it
 
 
-def test_masks_come_back_in_pixels_of_the_photograph(
-    track: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_masks_come_back_in_pixels_of_the_photograph(track: Callable[..., Path]) -> None:
     """The ball is found as well as through the pinhole; a mask that is known lands where OpenCV says."""
     run = track("bent", ROOM, "--no-map", "--pointmaps", "depth")
     straight = figures(track("straight", (225, 225, 119.5, 89.5), "--no-map", "--pointmaps", "depth"))
@@ -329,18 +328,20 @@ def test_masks_come_back_in_pixels_of_the_photograph(
     points = spread_rays(r, 12.0)[[0, 7, 19]]  # two near corners, one within
     known = spots(r.pinhole.project(points), r.size)[..., 0].astype(np.float32) / 255
 
-    class Known:
-        """A belief that says the same of every frame."""
+    class Known(LogOddsModel):
+        """A smoother that says the same of every frame."""
 
-        def __init__(self, *_: Any) -> None: ...
+        def smoother(self, *_: Any) -> Any:
+            return self
 
-        def masks(self, frames: Iterator[DynamicsInput]) -> Iterator[DynamicMask]:
-            for given in frames:
-                assert given.gray.shape == known.shape  # this clip is small: tracking shrinks nothing
-                yield DynamicMask(known, known > 0.5, {})
+        def masks(self, inputs: Iterator[tuple[DynamicsInput, Any]]) -> Iterator[tuple[DynamicMask, Any]]:
+            for frame, beside in inputs:
+                assert frame.gray.shape == known.shape  # this clip is small: tracking shrinks nothing
+                yield DynamicMask(known, known > 0.5, {}), beside
 
-    monkeypatch.setattr(smooth_masks, "ForwardBackwardSmoother", Known)
-    files = sorted((track("bent", ROOM, "--no-map") / "masks").iterdir())
+    with DYNAMICS.registered("known", Known):
+        run = track("bent", ROOM, "--no-map", "--set", "dynamics.variant=known")
+    files = sorted((run / "masks").iterdir())
     assert len(files) == 24
     mask = cv2.imread(str(files[5]), cv2.IMREAD_UNCHANGED)
     assert mask is not None and mask.shape == ROOM_SIZE[::-1]

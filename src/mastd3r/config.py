@@ -1,23 +1,34 @@
-"""One frozen dataclass a stage; ``Config`` joins them. YAML in and out; unknown keys are refused."""
+"""One frozen dataclass a stage; ``Config`` joins them. YAML in and out; unknown keys are refused.
+
+A key that was renamed is taken under its old name for one version, see ``RENAMED``.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import logging
 import types
 import typing
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import yaml
 
 from .dynamics.config import DynamicsConfig
 from .errors import ConfigError
+from .registry import ALIGNMENT, FEATURES, MAP_BACKENDS, PLACES, POINTMAPS, SEMANTICS, Registry
 
-PointmapKind = Literal["auto", "geometric", "mast3r", "depth"]
-SemanticsKind = Literal["auto", "none", "dinov2", "maps"]
-CorrectionKind = Literal["none", "coarse", "fine", "coarse-to-fine"]
+log = logging.getLogger(__name__)
+
+PointmapKind = Annotated[str, POINTMAPS]  # names of a registry: also those that were registered from outside
+FeaturesKind = Annotated[str, FEATURES]
+SemanticsKind = Annotated[str, SEMANTICS]
+PlacesKind = Annotated[str, PLACES]
+CorrectionKind = Annotated[str, ALIGNMENT]
+MapBackendKind = Annotated[str, MAP_BACKENDS]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
 SourceKind = Literal[
     "auto", "video", "images", "tum", "bonn", "kitti-raw", "kitti-odometry", "7scenes", "euroc", "replica"
@@ -66,9 +77,7 @@ class AlignmentConfig:
 
     chamfer_weight: float = 0.1  # lambda_cham of eq. (12)
     min_matches: int = 40  # weighted matches below which a pair cannot be aligned
-    as_printed: bool = (
-        False  # True: eq. (11)(12) with 3-D residuals alone, on SE(3), for views with points of their own
-    )
+    as_printed: bool = False  # True: eq. (11)(12) as printed: 3-D residuals alone, on SE(3), for views with own points
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,7 @@ class MappingConfig:
 
     enabled: bool = True
     device: MapDeviceKind = "auto"  # auto: the accelerator where gsplat draws on it, the CPU otherwise
+    backend: MapBackendKind = "auto"  # what draws the Gaussians; auto: gsplat on an accelerator, numba on the CPU
     loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
     width_px: int = 320  # width of the images that the map is trained on and rendered at
     iterations: int = 3000  # optimisation steps, one view each
@@ -134,10 +144,10 @@ class Config:
     """Everything that decides a run, beside the source itself."""
 
     pointmaps: PointmapKind = "auto"
+    features: FeaturesKind = "orb"  # sparse features, where dense flow ends: after a jump, across a loop
     semantics: SemanticsKind = "auto"
+    places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"
-    features: str = "orb"
-    places: str = "auto"
     seed: int = 0
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
@@ -149,9 +159,79 @@ class Config:
     networks: NetworksConfig = field(default_factory=NetworksConfig)
 
 
+PRESETS: dict[str, tuple[str, ...]] = {  # name -> what it changes of the defaults, as ``with_override`` takes it
+    "paper": (  # every equation as printed
+        "dynamics.variant=paper",
+        "alignment.as_printed=true",
+        "mapping.paper_loss=true",
+        "mapping.hard_weight=true",
+    ),
+}
+
+_DYNAMICS_RENAMED = {
+    "use_motion": "motion.enabled",
+    "flow_noise_px": "motion.flow_noise_px",
+    "texture_noise": "motion.texture_noise",
+    "motion_spread_px": "motion.spread_px",
+    "round_trip_px": "motion.round_trip_px",
+    "pose_doubt_deg": "motion.pose_sigma_deg",
+    "use_doubt": "motion.noise_inflation",
+    "doubt_tolerance": "motion.noise_tolerance",
+    "photo_noise": "photometric.noise",
+    "photo_shift_px": "photometric.shift_px",
+    "photo_gain": "photometric.gain",
+    "clash_gain": "photometric.unexplained_gain",
+    "use_depth": "depth.enabled",
+    "depth_noise_ratio": "depth.noise_ratio",
+    "use_support": "support.enabled",
+    "floating_gain": "support.floating_gain",
+    "use_semantic": "semantic.enabled",
+    "semantic_gain": "semantic.gain",
+    "semantic_share": "semantic.evidence_share",
+    "semantic_floor": "semantic.floor",
+    "semantic_missed": "semantic.missed",
+    "semantic_reach": "semantic.reach_ratio",
+    "use_time": "temporal.enabled",
+    "memory": "temporal.memory",
+    "carry_mismatch": "temporal.carry_mismatch",
+    "gaps": "temporal.filter_gaps",
+    "second_gaps": "temporal.smoother_gaps",
+    "use_future": "temporal.backward",
+    "use_head": "appearance.enabled",
+    "head_share": "appearance.share",
+    "head_limit": "appearance.max_log_odds",
+    "head_memory": "appearance.memory",
+    "use_regions": "refinement.enabled",
+    "region_px": "refinement.region_px",
+    "region_contrast": "refinement.region_contrast",
+    "semantic_contrast": "refinement.semantic_contrast",
+    "chroma_gain": "refinement.chroma_gain",
+    "edge_px": "refinement.edge_px",
+    "edge_contrast": "refinement.edge_contrast",
+    "fine_px": "refinement.fine_px",
+    "fine_contrast": "refinement.fine_contrast",
+    "map_contrast": "refinement.fine_contrast_semantic",
+    "tau_variance": "paper.tau_variance",
+    "tau_sigma": "paper.tau_sigma",
+    "window_px": "paper.window_px",
+    "tau_bayes": "paper.tau_bayes",
+}
+RENAMED = {f"dynamics.{old}": f"dynamics.{new}" for old, new in _DYNAMICS_RENAMED.items()}  # old dotted key -> new
+
+
 def config_from_dict(data: dict[str, Any]) -> Config:
     """Build a Config from nested mappings. Raises ConfigError for unknown keys and wrong types."""
-    return _build(Config, data, "")
+    return _merged(Config(), data)
+
+
+def preset(name: str) -> Config:
+    """The defaults with what a preset of ``PRESETS`` changes. Raises ConfigError for another name."""
+    if name not in PRESETS:
+        raise ConfigError(f"preset: expected one of {', '.join(PRESETS)}, got {name!r}")
+    config = Config()
+    for item in PRESETS[name]:
+        config = with_override(config, item)
+    return config
 
 
 def config_from_yaml(path: Path) -> Config:
@@ -176,7 +256,7 @@ def with_override(config: Config, dotted: str) -> Config:
         raise ConfigError(f"--set {key}: expected a YAML value, got {text!r} ({_one_line(e)})") from e
     for part in reversed(key.split(".")):
         nested = {part: nested}
-    return _merge(config, nested, "")
+    return _merged(config, nested)
 
 
 def config_to_yaml(config: Config) -> str:
@@ -194,14 +274,47 @@ def _plain(value: Any) -> Any:
     return [_plain(v) for v in value] if isinstance(value, tuple) else value
 
 
-def _build(cls: type, data: dict[str, Any], where: str) -> Any:
-    return _merge(cls(), data, where)
+def _merged(config: Config, data: Any) -> Config:
+    merged: Config = _merge(config, _with_new_names(data), "")
+    return merged
+
+
+def _with_new_names(data: Any, where: str = "") -> Any:
+    """``data`` with every key of ``RENAMED`` under its new name. Raises ConfigError where both names are given."""
+    if not isinstance(data, dict):
+        return data
+    out: dict[Any, Any] = {}
+    moved: list[tuple[str, Any]] = []
+    for key, value in data.items():
+        old = f"{where}{key}"
+        if old in RENAMED:
+            _say_renamed(old)
+            moved.append((old, value))
+        else:
+            out[key] = _with_new_names(value, f"{old}.")
+    for old, value in moved:
+        *sections, last = RENAMED[old].removeprefix(where).split(".")
+        place = out
+        for section in sections:
+            place = place.setdefault(section, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"config {where}{section}: expected key: value pairs, got {place!r}")
+        if last in place:
+            raise ConfigError(f"config: expected {RENAMED[old]} or its old name {old}, got both")
+        place[last] = value
+    return out
+
+
+@cache
+def _say_renamed(old: str) -> None:
+    """Once a process: a suite reads its settings many times over."""
+    log.warning("config: %s is now %s; the old name goes with the next version", old, RENAMED[old])
 
 
 def _merge(obj: Any, data: Any, where: str) -> Any:
     if not isinstance(data, dict):
         raise ConfigError(f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {data!r}")
-    hints = typing.get_type_hints(type(obj))
+    hints = typing.get_type_hints(type(obj), include_extras=True)
     names = [f.name for f in fields(obj)]
     changes: dict[str, Any] = {}
     for key, value in data.items():
@@ -217,13 +330,21 @@ def _merge(obj: Any, data: Any, where: str) -> Any:
     return replace(obj, **changes)
 
 
+def _chosen(value: Any, hint: Any, where: str) -> Any:
+    """A value of a registry's names, or of a Literal."""
+    if typing.get_origin(hint) is Annotated:
+        registry: Registry = hint.__metadata__[0]
+        return registry.check(value, where=f"config {where}")
+    options = typing.get_args(hint)
+    if value not in options:
+        raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
+    return value
+
+
 def _checked(value: Any, hint: Any, where: str) -> Any:
     origin = typing.get_origin(hint)
-    if origin is Literal:
-        options = typing.get_args(hint)
-        if value not in options:
-            raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
-        return value
+    if origin in (Annotated, Literal):
+        return _chosen(value, hint, where)
     if origin in (typing.Union, types.UnionType):
         if value is None:
             return None

@@ -86,13 +86,13 @@ class Aligner(Protocol):
 class DynamicsFilter(Protocol):
     """The mask while the video is read: it knows the frames before. Frames come in order."""
 
-    appearance: Any  # what it learned of the looks of moving things, for the smoother; None: nothing
+    appearance: Any  # what it learned of the appearance of moving things, for the smoother; None: nothing
 
     def prior(self, gray: Array, semantic: Array | None = None, features: Array | None = None) -> Array:
         """P(moving) (h, w) float32 before the pose is known: the prior of eq. (2)."""
         ...
 
-    def update(self, given: DynamicsInput) -> DynamicMask:
+    def update(self, frame: DynamicsInput) -> DynamicMask:
         """P(moving) once the pose is known, eq. (1)-(4)."""
         ...
 
@@ -111,11 +111,11 @@ class DynamicsModel(Protocol):
     needs_features: bool  # descriptors of frames are made for it
 
     def filter(self, width: int, height: int) -> DynamicsFilter:
-        """A mask for tracking images of this size."""
+        """The masks while tracking, of images of this size."""
         ...
 
     def smoother(self, width: int, height: int, appearance: Any = None) -> DynamicsSmoother:
-        """A mask for the second pass; ``appearance`` is what the filter learned."""
+        """The masks of the smoothing pass; ``appearance`` is what the filter learned."""
         ...
 
 

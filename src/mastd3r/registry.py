@@ -111,9 +111,9 @@ ALIGNMENT.register("coarse", "alignment.align:build_coarse", "eq. (8)-(10)")
 ALIGNMENT.register("fine", "alignment.align:build_fine", "eq. (11)(12)")
 ALIGNMENT.register("coarse-to-fine", "alignment.align:build_coarse_to_fine", "eq. (8)-(12)")
 
-DYNAMICS.register("ours", "dynamics.shim:build", "log-odds filter over motion, depth, semantics, time, appearance")
-DYNAMICS.register("paper", "dynamics.shim:build", "eq. (1)-(4) as printed")
-DYNAMICS.register("none", "dynamics.shim:build", "nothing moves")
+DYNAMICS.register("ours", "dynamics.ours:build", "log-odds filter over motion, depth, semantics, time, appearance")
+DYNAMICS.register("paper", "dynamics.paper:build", "eq. (1)-(4) as printed")
+DYNAMICS.register("none", "dynamics.none:build", "nothing moves")
 
 SEMANTICS.register("none", "sources.semantic_maps:build_none", "no prior")
 SEMANTICS.register("dinov2", "parts:build_dinov2", "DINOv2 foreground, see `mastd3r weights`")

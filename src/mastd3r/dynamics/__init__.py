@@ -3,5 +3,6 @@
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
 from .filter import LogOddsFilter
+from .smoother import ForwardBackwardSmoother
 
-__all__ = ["DynamicMask", "DynamicsConfig", "DynamicsInput", "LogOddsFilter"]
+__all__ = ["DynamicMask", "DynamicsConfig", "DynamicsInput", "ForwardBackwardSmoother", "LogOddsFilter"]

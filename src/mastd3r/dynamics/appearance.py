@@ -21,13 +21,13 @@ Array = NDArray[Any]
 WAVES = 64  # random features beside the descriptors themselves
 SAMPLES = 400  # pixels that one frame teaches
 SURE_LOG_ODDS = 3.0  # evidence from which a pixel teaches with full weight
-STANDING_SHARE = 0.25  # how often a thing that can move is seen to stand: one such look says only so much
+STANDING_SHARE = 0.25  # how often a thing that can move is seen to stand: one such sample says only so much
 PRIOR_INFO = 4.0  # of every weight, in pixels' worth
 FRAME_SHARE = 0.2  # pixels of a frame repeat one another: each counts for so much
 
 
 class AppearanceClassifier:
-    """One per video; the first and the second pass may share it. Deterministic."""
+    """One per video; tracking and the smoothing pass may share it. Deterministic."""
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
@@ -35,7 +35,7 @@ class AppearanceClassifier:
         self._centre = self._scale = self._waves = self._phase = np.zeros(0, np.float32)
         self._weights = self._start = np.zeros(0)
         self._info = np.zeros((0, 0))
-        self._moving_seen = 0.0  # samples that moved
+        self._moving_samples = 0.0  # samples that moved
 
     def copy(self) -> AppearanceClassifier:
         """What it knows now; either may learn on without the other."""
@@ -51,34 +51,35 @@ class AppearanceClassifier:
         if len(self._weights) == 0 or len(self._centre) != features.shape[2]:
             self._begin(cells)
         z = self._lifted(cells[at]).astype(np.float64)
-        said = np.clip(target[at], np.log(STANDING_SHARE), SURE_LOG_ODDS)
-        label = 1 / (1 + np.exp(-(z @ self._weights + said)))  # what may move is not refuted by standing
-        self._moving_seen += float((target[at] > SURE_LOG_ODDS).sum())
-        forget = self.config.head_memory
+        evidence = np.clip(target[at], np.log(STANDING_SHARE), SURE_LOG_ODDS)
+        label = 1 / (1 + np.exp(-(z @ self._weights + evidence)))  # what may move is not refuted by standing
+        self._moving_samples += float((target[at] > SURE_LOG_ODDS).sum())
+        memory = self.config.appearance.memory
         prior = PRIOR_INFO * np.eye(len(self._weights))
-        old, kept = self._weights.copy(), forget * self._info + (1 - forget) * prior
+        old, kept = self._weights.copy(), memory * self._info + (1 - memory) * prior
         for _ in range(2):  # Newton, from the weights so far
             p = 1 / (1 + np.exp(-z @ self._weights))
             curved = FRAME_SHARE * sure * np.maximum(p * (1 - p), 1e-3)
             info = kept + (z * curved[:, None]).T @ z
             slope = z.T @ (FRAME_SHARE * sure * (label - p)) - kept @ (self._weights - old)
             self._weights = self._weights + np.linalg.solve(
-                info, slope - (1 - forget) * PRIOR_INFO * (old - self._start)
+                info, slope - (1 - memory) * PRIOR_INFO * (old - self._start)
             )
         self._info = info
 
     def log_odds(self, features: Array) -> Array | None:
-        """(h', w') float32 log-odds of moving by looks alone; None before anything was seen to move.
+        """(h', w') float32 log-odds of moving by appearance alone; None before anything was seen to move.
 
-        Beyond the base rate. Shrunk where the weights are unsure (MacKay's approximation), bounded by ``head_limit``.
+        Beyond the base rate. Shrunk where the weights are unsure (MacKay's approximation), bounded by
+        ``appearance.max_log_odds``.
         """
-        if self._moving_seen < SAMPLES / 4 or len(self._centre) != features.shape[2]:
+        if self._moving_samples < SAMPLES / 4 or len(self._centre) != features.shape[2]:
             return None
         z = self._lifted(features.reshape(-1, features.shape[2]).astype(np.float32))
         spread = np.linalg.cholesky(np.linalg.inv(self._info)).astype(np.float32)
         variance = ((z @ spread) ** 2).sum(1)
         value = z @ self._weights.astype(np.float32) / np.sqrt(1 + np.pi / 8 * variance)
-        limit = self.config.head_limit
+        limit = self.config.appearance.max_log_odds
         value = value - np.float32(self._start[0])
         return np.clip(value, -limit, limit).reshape(features.shape[:2]).astype(np.float32)
 
@@ -93,7 +94,7 @@ class AppearanceClassifier:
         self._start = np.zeros(n)
         self._start[0] = np.log(self.config.base_rate / (1 - self.config.base_rate))
         self._weights, self._info = self._start.copy(), PRIOR_INFO * np.eye(n)
-        self._moving_seen = 0.0
+        self._moving_samples = 0.0
 
     def _lifted(self, cells: Array) -> Array:
         """(n, 1 + linear + WAVES): a constant, the descriptors (few channels only) and their waves."""

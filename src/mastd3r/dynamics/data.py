@@ -8,6 +8,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
+from ..errors import InputError
 
 Array = NDArray[Any]
 
@@ -25,8 +26,8 @@ class DynamicsInput:
     inv_depth_sigma: Array  # (h, w) float32, 1 sigma; inf = unknown
     own_inv_depth: Array | None = None  # (h, w) float32 measured in this frame, 0 = none
     semantic: Array | None = None  # (h, w) float32 P(movable)
-    color: Array | None = None  # (h, w, 3) uint8 RGB; outlines follow its edges where it is there
-    features: Array | None = None  # (h', w', c) float32 descriptors of any kind, for the head
+    color: Array | None = None  # (h, w, 3) uint8 RGB; the refinement follows its edges where it is there
+    features: Array | None = None  # (h', w', c) float32 descriptors of any kind, for the appearance classifier
 
 
 @dataclass(frozen=True)
@@ -36,3 +37,16 @@ class DynamicMask:
     probability: Array  # (h, w) float32
     moving: Array  # (h, w) bool
     evidence: dict[str, Array]  # name -> (h', w') float32 log-likelihood ratio, for display
+
+
+def check_image(image: Array, name: str, width: int, height: int) -> None:
+    """Raises InputError for an image of another size."""
+    if image.shape != (height, width):
+        raise InputError(f"dynamics: expected {name} of {width}x{height}, got shape {image.shape}")
+
+
+def check_input(frame: DynamicsInput, width: int, height: int) -> None:
+    """Raises InputError for images of another size."""
+    for name in ("gray", "inv_depth", "inv_depth_sigma", "own_inv_depth"):
+        if getattr(frame, name) is not None:
+            check_image(getattr(frame, name), name, width, height)

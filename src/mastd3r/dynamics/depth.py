@@ -17,19 +17,19 @@ _FRONT, _BEHIND = 0.8, 0.2  # share of a moving thing's mass before and behind t
 _SPAN = 3.0  # width of the broad law on each side, in log depth: a factor of 20
 
 
-def depth_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
+def depth_log_ratio(frame: DynamicsInput, config: DynamicsConfig) -> Array:
     """log P(Z|D) - log P(Z|not D), (h, w) float32, 0 where either depth is unknown.
 
     Not D: normal around the background, its variance and the measurement's added, with a share of wrong depths.
     D: uniform in log depth, with more mass in front of the background than behind.
     """
-    if given.own_inv_depth is None:
-        return np.zeros(given.gray.shape, np.float32)
-    maps = (given.own_inv_depth, given.inv_depth, given.inv_depth_sigma)
+    if frame.own_inv_depth is None:
+        return np.zeros(frame.gray.shape, np.float32)
+    maps = (frame.own_inv_depth, frame.inv_depth, frame.inv_depth_sigma)
     flat = (np.ascontiguousarray(m, np.float32).reshape(-1) for m in maps)
-    shares = config.depth_noise_ratio, config.still_share, config.outlier_share
+    shares = config.depth.noise_ratio, config.still_share, config.outlier_share
     ratio: Array = _log_ratio(*flat, *shares)
-    return ratio.reshape(given.gray.shape)
+    return ratio.reshape(frame.gray.shape)
 
 
 @nb.njit(cache=True, error_model="numpy", nogil=True)

@@ -21,11 +21,11 @@ CELL_PX = 8  # depths are solved for cells of about this size
 LEAST_LEAP, SURE_LEAP = np.log(2.0), np.log(3.0)  # of depth, on the best way to the border, beyond both sigmas
 
 
-def floating_log_ratio(given: DynamicsInput, config: DynamicsConfig) -> Array:
+def floating_log_ratio(frame: DynamicsInput, config: DynamicsConfig) -> Array:
     """log P(leap | moving) - log P(leap | static), (h, w) float32 in 0 … ``floating_gain``; 0 where depth is held."""
-    leap = leap_to_border(given.inv_depth, given.inv_depth_sigma)
-    ratio = config.floating_gain * np.clip((leap - LEAST_LEAP) / (SURE_LEAP - LEAST_LEAP), 0, 1)
-    height, width = given.inv_depth.shape
+    leap = leap_to_border(frame.inv_depth, frame.inv_depth_sigma)
+    ratio = config.support.floating_gain * np.clip((leap - LEAST_LEAP) / (SURE_LEAP - LEAST_LEAP), 0, 1)
+    height, width = frame.inv_depth.shape
     full: Array = cv2.resize(ratio.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     return full
 
@@ -50,5 +50,5 @@ def leap_to_border(inv_depth: Array, sigma: Array) -> Array:
         if np.array_equal(reached, level):
             break
         level = reached
-    leap: Array = cv2.erode((np.log(inv) - spread - level).astype(np.float32), around)  # cells at an outline are mixed
+    leap: Array = cv2.erode((np.log(inv) - spread - level).astype(np.float32), around)  # cells at an edge are mixed
     return leap

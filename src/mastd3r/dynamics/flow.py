@@ -25,7 +25,7 @@ class HalfFlow:
         if not hasattr(self._of_thread, "engines"):
             fine, quick = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST) for _ in range(2))
             fine.setFinestScale(1)
-            fine.setPatchSize(6)  # small patches: a moving thing's flow bleeds less over its outline
+            fine.setPatchSize(6)  # small patches: a moving thing's flow bleeds less over its edge
             fine.setPatchStride(4)
             fine.setGradientDescentIterations(10)
             fine.setVariationalRefinementIterations(3)

@@ -60,16 +60,16 @@ def pose_jacobian(xy: Array, inv_depth: Array, focal_px: float) -> Array:
 def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: float, prior_sigma: Array) -> Array:
     """(6,) twist that explains the residual (n, 2) of the static majority: reweighted least squares, Cauchy weights.
 
-    ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): how far a pose may be off before it is doubted.
+    ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): 1 sigma of how far a pose may be off.
     """
     twist = np.zeros(6)
     rows, target = jacobian.reshape(-1, 6).astype(np.float64), residual.reshape(-1)
-    scale, doubt = 4 * noise_px, np.diag(1 / prior_sigma**2)
+    scale, prior_info = 4 * noise_px, np.diag(1 / prior_sigma**2)
     for _ in range(6):
         left = (target - rows @ twist).reshape(-1, 2)
         w = weight / (1 + (left**2).sum(-1) / scale**2) / noise_px**2
         weighted = rows * np.repeat(w, 2)[:, None]
-        twist = np.linalg.solve(rows.T @ weighted + doubt, weighted.T @ target)
+        twist = np.linalg.solve(rows.T @ weighted + prior_info, weighted.T @ target)
         scale = max(0.6 * scale, 1.5 * noise_px)
     return twist
 
@@ -116,13 +116,13 @@ def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
 def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Array:
     """log p(residual | moving) - log p(residual | static), (h, w) float32.
 
-    Static: Normal(0, cov) with a share of wrong flow. Moving: the same widened by motion_spread_px, and a share
+    Static: Normal(0, cov) with a share of wrong flow. Moving: the same widened by ``motion.spread_px``, and a share
     that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
     where a number is not finite.
     """
     flat = residual.reshape(-1, 2), cov.reshape(-1, 3)
-    given = (np.ascontiguousarray(v, np.float32) for v in flat)
-    ratio: Array = _log_ratio(*given, config.motion_spread_px**2, config.still_share, config.outlier_share)
+    contiguous = (np.ascontiguousarray(v, np.float32) for v in flat)
+    ratio: Array = _log_ratio(*contiguous, config.motion.spread_px**2, config.still_share, config.outlier_share)
     return ratio.reshape(residual.shape[:-1])
 
 
@@ -152,7 +152,7 @@ def _log_ratio(residual: Array, cov: Array, spread: float, still_share: float, o
 
 
 def along_epipolar(cov: Array, slope: Array, inv_depth_sigma: Array) -> Array:
-    """``cov`` (h, w, 3) grown by the depth's 1 sigma along ``slope`` (h, w, 2): the part a depth may explain."""
+    """``cov`` (h, w, 3) widened by the depth's 1 sigma along ``slope`` (h, w, 2): the part a depth may explain."""
     reach = np.nan_to_num(slope * inv_depth_sigma[..., None], nan=_UNKNOWN_PX, posinf=_UNKNOWN_PX, neginf=-_UNKNOWN_PX)
     reach = np.clip(reach, -_UNKNOWN_PX, _UNKNOWN_PX)
     dx, dy = reach[..., 0], reach[..., 1]

@@ -62,7 +62,7 @@ class Comparison:
 
 
 class MotionTest:
-    """Holds the lens and the flow engine; knows nothing of earlier beliefs."""
+    """Holds the lens and the flow engine; knows nothing of earlier log-odds."""
 
     def __init__(self, config: DynamicsConfig, flow: HalfFlow, width: int, height: int) -> None:
         self.config, self.width, self.height = config, width, height
@@ -71,12 +71,12 @@ class MotionTest:
         self._rays = np.zeros((3, height, width), np.float32)
         self._beside = ThreadPoolExecutor(1, "compare")
 
-    def present(self, given: DynamicsInput, small: Array, texture: Information) -> Present:
+    def present(self, frame: DynamicsInput, small: Array, texture: Information) -> Present:
         """What ``compare`` is to know of a frame; ``small`` is its (h, w) uint8 grey image."""
-        self._lens(given.camera)
-        inv_depth, sigma = self._background(given)
-        cov = flow_covariance(texture, self.config.flow_noise_px, 2 * self.config.motion_spread_px)
-        return Present(small, given.world_from_cam, inv_depth, sigma, cov, photo_variance(texture, self.config))
+        self._lens(frame.camera)
+        inv_depth, sigma = self._background(frame)
+        cov = flow_covariance(texture, self.config.motion.flow_noise_px, 2 * self.config.motion.spread_px)
+        return Present(small, frame.world_from_cam, inv_depth, sigma, cov, photo_variance(texture, self.config))
 
     def compare(self, pairs: Sequence[tuple[Present, Array, Past]]) -> list[Comparison]:
         """Log ratios of each (frame, its prior P(static) (h, w), other frame), in order, on two threads.
@@ -92,6 +92,7 @@ class MotionTest:
     def _one(self, frame: Present, static: Array, past: Past) -> Comparison:
         """The past image is first drawn as a rigid scene would show it now; only what is left is flow."""
         assert self._camera is not None
+        c = self.config.motion
         small = frame.gray
         past_from_cur = inverse(past.world_from_cam) @ frame.world_from_cam
         rigid = rigid_flow(self._camera, self._rays, past_from_cur, frame.inv_depth)
@@ -99,19 +100,19 @@ class MotionTest:
         left = self._flow.between(small, stable)
         inside = self._inside(rigid)
         error = self._flow.round_trip_px(left, self._flow.quick(stable, small))
-        trust = np.exp(-0.5 * (error / self.config.round_trip_px) ** 2) * inside
-        residual = left - self._pose_error(rigid, left, trust * static)
+        confidence = np.exp(-0.5 * (error / c.round_trip_px) ** 2) * inside
+        residual = left - self._pose_error(rigid, left, confidence * static)
         wide = along_epipolar(frame.flow_cov, rigid.slope, frame.inv_depth_sigma)
-        if self.config.use_doubt:
-            wide = wide * np.float32(max(1.0, noise_inflation(residual, wide, inside) / self.config.doubt_tolerance))
-        ratio = motion_log_ratio(residual, wide, self.config) * trust
+        if c.noise_inflation:
+            wide = wide * np.float32(max(1.0, noise_inflation(residual, wide, inside) / c.noise_tolerance))
+        ratio = motion_log_ratio(residual, wide, self.config) * confidence
         covered = self._flow.warp(past.moving, rigid.target)
-        open_to_doubt = (1 - trust) * (1 - covered)
-        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, open_to_doubt)
+        unmatched = (1 - confidence) * (1 - covered)
+        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, unmatched)
         return Comparison(ratio.astype(np.float32), rigid.target - self._flow.grid + left)
 
     def _grey_values(
-        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array, open_to_doubt: Array
+        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array, unmatched: Array
     ) -> Array:
         """Static where the rigid warp fits better than the flow; moving where neither flow nor warp explains it.
 
@@ -120,20 +121,20 @@ class MotionTest:
         cur, still = small.astype(np.float32), stable.astype(np.float32)
         still *= float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3)
         as_static = mismatch(cur, still, noise)
-        if self.config.use_doubt:
+        if self.config.motion.noise_inflation:
             typical = float(np.median(as_static[inside > 0])) if inside.any() else 1.0
-            noise = noise * max(1.0, typical / self.config.doubt_tolerance)
+            noise = noise * max(1.0, typical / self.config.motion.noise_tolerance)
             as_static = mismatch(cur, still, noise)
         as_flow = mismatch(cur, self._flow.warp(still, self._flow.grid + left), noise)
-        clash = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * open_to_doubt
-        fits = np.clip(self.config.photo_gain * (as_static - as_flow), -3, 0)
-        return self.config.clash_gain * clash + fits
+        unexplained = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * unmatched
+        fits = np.clip(self.config.photometric.gain * (as_static - as_flow), -3, 0)
+        return self.config.photometric.unexplained_gain * unexplained + fits
 
-    def _background(self, given: DynamicsInput) -> tuple[Array, Array]:
+    def _background(self, frame: DynamicsInput) -> tuple[Array, Array]:
         """Half-size inverse depth and 1 sigma; unknown pixels get the median and a sigma as wide as the scene."""
         size = (self.width, self.height)
-        inv_depth = cv2.resize(given.inv_depth, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
-        sigma = cv2.resize(given.inv_depth_sigma, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
+        inv_depth = cv2.resize(frame.inv_depth, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
+        sigma = cv2.resize(frame.inv_depth_sigma, size, interpolation=cv2.INTER_NEAREST).astype(np.float32)
         known = np.isfinite(sigma) & np.isfinite(inv_depth) & (inv_depth >= 0)
         middle = float(np.median(inv_depth[known])) if known.any() else 1.0
         wide = 3 * max(middle, 1e-6)
@@ -156,12 +157,12 @@ class MotionTest:
         focal = self._camera.fx_px
         rows = (slice(3, None, 6), slice(3, None, 6))
         near = max(float(np.median(rigid.inv_depth[rows])), 1e-9)
-        limit = np.deg2rad(self.config.pose_doubt_deg)
+        limit = np.deg2rad(self.config.motion.pose_sigma_deg)
         twist = residual_twist(
             pose_jacobian(rigid.xy[rows].reshape(-1, 2), rigid.inv_depth[rows].ravel(), focal),
             left[rows].reshape(-1, 2).astype(float),
             weight[rows].ravel().astype(float),
-            self.config.flow_noise_px,
+            self.config.motion.flow_noise_px,
             np.array([limit / near] * 3 + [limit] * 3),
         )
         x, y, near_by = rigid.xy[..., 0], rigid.xy[..., 1], rigid.inv_depth

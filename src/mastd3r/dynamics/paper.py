@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .config import DynamicsConfig
+from .data import DynamicMask, DynamicsInput, check_image, check_input
+from .refinement import EdgeRefinement, sigmoid
+
 Array = NDArray[Any]
+T = TypeVar("T")
 
 
 def local_log_variance(log_depth: Array, valid: Array, window_px: int) -> Array:
@@ -68,3 +74,63 @@ def depth_likelihoods(depth: Array) -> tuple[Array, Array]:
     span = max(float(np.ptp(log_depth[valid])), 1e-3)
     static = np.exp(-0.5 * ((log_depth - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
     return np.where(valid, 1 / span, even), np.where(valid, np.maximum(static, 1e-12), even)
+
+
+class PaperMask:
+    """Filter and smoother at once: eq. (1)-(4) know one frame alone."""
+
+    appearance = None
+
+    def __init__(self, config: DynamicsConfig, width: int, height: int) -> None:
+        """``width``, ``height``: the working size of every image that comes later."""
+        self.config, self.width, self.height = config, width, height
+        self._semantic_log_odds = EdgeRefinement(config, width, height).semantic_log_odds
+
+    def prior(self, gray: Array, semantic: Array | None = None, features: Array | None = None) -> Array:
+        """P(D|S) of eq. (2), (h, w) float32. Raises InputError for an image of another size."""
+        check_image(gray, "gray", self.width, self.height)
+        return sigmoid(self._semantic_log_odds(semantic))
+
+    def update(self, frame: DynamicsInput) -> DynamicMask:
+        """Eq. (1)-(4). Z is the frame's own depth, or the background's without one. Raises InputError."""
+        check_input(frame, self.width, self.height)
+        c = self.config.paper
+        inv = frame.inv_depth if frame.own_inv_depth is None else frame.own_inv_depth
+        depth = np.where(inv > 0, 1 / np.maximum(inv, 1e-9), 0.0)
+        anomaly = depth_anomaly(depth, c.window_px, c.tau_variance, c.tau_sigma)
+        moving, static = depth_likelihoods(depth)
+        prior = sigmoid(self._semantic_log_odds(frame.semantic)).astype(np.float64)
+        log_odds = posterior_log_odds(prior, moving, static)
+        mask = coarse_mask(moving_mask(log_odds, c.tau_bayes), anomaly)
+        posterior = sigmoid(log_odds)
+        unmarked = np.minimum(posterior, self.config.base_rate)
+        probability = np.where(anomaly, posterior, unmarked).astype(np.float32)
+        ratio = np.log(moving / static).astype(np.float32)
+        return DynamicMask(probability, mask, {"depth": ratio, "anomaly": anomaly.astype(np.float32)})
+
+    def masks(self, inputs: Iterable[tuple[DynamicsInput, T]]) -> Iterator[tuple[DynamicMask, T]]:
+        """One mask an input, at once, with what came beside it. Raises InputError."""
+        for frame, beside in inputs:
+            yield self.update(frame), beside
+
+
+class PaperModel:
+    """Eq. (1)-(4) as printed, while tracking and after it."""
+
+    needs_features = False
+
+    def __init__(self, config: DynamicsConfig) -> None:
+        self.config = config
+
+    def filter(self, width: int, height: int) -> PaperMask:
+        """For images of this working size."""
+        return PaperMask(self.config.while_tracking(), width, height)
+
+    def smoother(self, width: int, height: int, appearance: Any = None) -> PaperMask:
+        """For images of this working size."""
+        return PaperMask(self.config, width, height)
+
+
+def build(config: DynamicsConfig) -> PaperModel:
+    """For the registry."""
+    return PaperModel(config)

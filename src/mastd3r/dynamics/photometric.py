@@ -14,9 +14,10 @@ Array = NDArray[Any]
 
 def photo_variance(information: tuple[Array, Array, Array], config: DynamicsConfig) -> Array:
     """(h, w) variance of a grey difference: sensor noise, and the texture times a small misalignment."""
-    per_px = config.texture_noise**2 / 49
+    c = config.photometric
+    per_px = config.motion.texture_noise**2 / 49
     gradient = (information[0] + information[2]) * per_px
-    return config.photo_noise**2 + config.photo_shift_px**2 * gradient
+    return c.noise**2 + c.shift_px**2 * gradient
 
 
 def mismatch(cur: Array, other: Array, variance: Array) -> Array:

@@ -15,7 +15,7 @@ from ..geometry.se3 import transform
 from .flow import HalfFlow
 
 Array = NDArray[Any]
-GREY_DOUBT = 12.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
+GREY_EXPLAINED = 12.0  # grey levels; where a static scene explains the photograph better than this, flow has no say
 GREY_WRONG = 36.0  # where neither a static scene nor the flow comes nearer than this, there is no match
 
 
@@ -54,22 +54,22 @@ def reprojection_residual_px(
     least = np.full(small.shape, np.inf, np.float32)
     for kf in keyframes:
         points_kf = transform(kf.cam_from_world @ world_from_cam, points_cam)
-        seen = points_kf[..., 2] > 0
-        target = camera.project(np.where(seen[..., None], points_kf, 1.0)).astype(np.float32)
-        seen &= (target >= 0).all(-1) & (target[..., 0] <= size[0] - 1) & (target[..., 1] <= size[1] - 1)
+        visible = points_kf[..., 2] > 0
+        target = camera.project(np.where(visible[..., None], points_kf, 1.0)).astype(np.float32)
+        visible &= (target >= 0).all(-1) & (target[..., 0] <= size[0] - 1) & (target[..., 1] <= size[1] - 1)
         covered = cv2.dilate(cv2.resize(kf.moving, size), np.ones((9, 9), np.uint8))
-        seen &= flow.warp(covered, target) < 128
+        visible &= flow.warp(covered, target) < 128
         kf_gray = cv2.resize(kf.gray, size, interpolation=cv2.INTER_AREA)
         carried_gray = flow.warp(kf_gray, target)
         left = flow.between(small, carried_gray)
-        gain = float(small[seen].mean() / max(carried_gray[seen].mean(), 1.0)) if seen.any() else 1.0
+        gain = float(small[visible].mean() / max(carried_gray[visible].mean(), 1.0)) if visible.any() else 1.0
         as_static, as_flow = (
             cv2.blur(np.abs(small - np.float32(gain) * image), (5, 5))
             for image in (carried_gray, flow.warp(carried_gray, flow.grid + left))
         )
         residual = np.where(as_flow > GREY_WRONG, unmatched_px, ratio * np.hypot(left[..., 0], left[..., 1]))
-        residual = residual * (as_static > GREY_DOUBT)
-        least = np.minimum(least, np.where(seen, residual, np.inf))
+        residual = residual * (as_static > GREY_EXPLAINED)
+        least = np.minimum(least, np.where(visible, residual, np.inf))
     return np.where(np.isfinite(least), least, 0).astype(np.float32)
 
 

@@ -17,9 +17,9 @@ FULL_SCALE_LOG = 4.0  # natural log-likelihood ratio that is drawn in full colou
 TITLES = {
     "motion": "motion: flow and grey values against the rigid scene",
     "depth": "depth: measured against the map",
-    "time": "time: the beliefs of the frames around",
+    "time": "time: the log-odds of the frames around",
     "semantic": "semantic prior",
-    "looks": "looks, learned from this video",
+    "appearance": "appearance, learned from this video",
     "anomaly": "depth anomaly, eq. (1)",
 }
 GREY, MOVING, STILL = (np.array(c, np.float32) for c in ((216, 216, 216), (202, 0, 32), (5, 82, 176)))

@@ -63,7 +63,7 @@ class GaussianMap:
             "colors": arrays.colors,
             "sh_rest": arrays.sh_rest,
         }
-        leaves = {
+        leaves: dict[str, Any] = {
             name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
             for name, array in plain.items()
         }
@@ -71,13 +71,14 @@ class GaussianMap:
 
     def picked(self, rows: torch.Tensor) -> GaussianMap:
         """A copy of some rows, in the order given (repeats allowed), as new leaves."""
-        tensors = {name: tensor.detach()[rows].requires_grad_() for name, tensor in self.parameters().items()}
+        rows_of = self.parameters().items()
+        tensors: dict[str, Any] = {name: tensor.detach()[rows].requires_grad_() for name, tensor in rows_of}
         return replace(self, **tensors, kf_id=self.kf_id[rows])
 
     def joined(self, other: GaussianMap) -> GaussianMap:
         """These rows, then the other's, as new leaves."""
         pairs = zip(self.parameters().items(), other.parameters().values(), strict=True)
-        tensors = {name: torch.cat([a.detach(), b.detach()]).requires_grad_() for (name, a), b in pairs}
+        tensors: dict[str, Any] = {name: torch.cat([a.detach(), b.detach()]).requires_grad_() for (name, a), b in pairs}
         return replace(self, **tensors, kf_id=torch.cat([self.kf_id, other.kf_id]))
 
     def draw(

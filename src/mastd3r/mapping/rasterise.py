@@ -11,7 +11,6 @@ from ..errors import ConfigError, InputError, MissingPackage
 from ..registry import AUTO, MAP_BACKENDS
 from .screen import ScreenStats
 
-
 OF_DEVICE = {"cpu": "numba", "cuda": "gsplat"}  # the backend that draws tensors of a device
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
@@ -40,7 +42,7 @@ def seed_gaussians(cloud: StaticCloud, limit: int, seed: int, device: str = "cpu
         "colors": np.asarray(cloud.colors)[rows] / 255.0,
         "sh_rest": np.zeros((len(rows), (sh_degree + 1) ** 2 - 1, 3)),
     }
-    leaves = {
+    leaves: dict[str, Any] = {
         name: torch.tensor(array, dtype=torch.float32, device=device).requires_grad_()
         for name, array in tensors.items()
     }
