@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mastd3r.camera.pinhole import Camera
-from mastd3r.dynamics import DynamicMask, DynamicsConfig, DynamicsInput, LogOddsFilter
-from mastd3r.dynamics.config import DepthConfig, MotionConfig, TemporalConfig
+from mastd3r.dynamics.config import DepthConfig, DynamicsConfig, MotionConfig, TemporalConfig
+from mastd3r.dynamics.data import DynamicMask, DynamicsInput
+from mastd3r.dynamics.filter import LogOddsFilter
 from mastd3r.errors import InputError
 from mastd3r.geometry.se3 import se3_exp
 from mastd3r.protocols import DynamicsFilter, DynamicsModel, DynamicsSmoother

@@ -12,7 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mastd3r.camera.pinhole import Camera
-from mastd3r.dynamics import DynamicsConfig, DynamicsInput, LogOddsFilter
+from mastd3r.dynamics.config import DynamicsConfig
+from mastd3r.dynamics.data import DynamicsInput
+from mastd3r.dynamics.filter import LogOddsFilter
 
 DATA = Path(os.environ.get("MASTD3R_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 W, H, SCALE = 512, 384, 0.37  # the map's unit is arbitrary

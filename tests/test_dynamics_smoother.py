@@ -10,9 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mastd3r.dynamics import DynamicMask, DynamicsConfig, DynamicsInput, LogOddsFilter
 from mastd3r.dynamics.appearance import AppearanceClassifier, plain_descriptors
-from mastd3r.dynamics.config import AppearanceConfig, TemporalConfig
+from mastd3r.dynamics.config import AppearanceConfig, DynamicsConfig, TemporalConfig
+from mastd3r.dynamics.data import DynamicMask, DynamicsInput
+from mastd3r.dynamics.filter import LogOddsFilter
 from mastd3r.dynamics.smoother import ForwardBackwardSmoother
 from mastd3r.offline.point_votes import PointVotes
 from test_dynamics_filter import CAMERA, THING, H, W, frame, input_of, iou

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mastd3r.dynamics import DynamicsConfig
-from mastd3r.dynamics.config import SemanticConfig, SupportConfig
+from mastd3r.dynamics.config import DynamicsConfig, SemanticConfig, SupportConfig
 from mastd3r.dynamics.depth_support import CELL_PX, SURE_LEAP, floating_log_ratio, leap_to_border
 from mastd3r.dynamics.refinement import EdgeRefinement
 from test_dynamics_filter import H, W, frame, input_of

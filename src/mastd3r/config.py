@@ -219,9 +219,9 @@ _DYNAMICS_RENAMED = {
 RENAMED = {f"dynamics.{old}": f"dynamics.{new}" for old, new in _DYNAMICS_RENAMED.items()}  # old dotted key -> new
 
 
-def config_from_dict(data: dict[str, Any]) -> Config:
-    """Build a Config from nested mappings. Raises ConfigError for unknown keys and wrong types."""
-    return _merged(Config(), data)
+def config_from_dict(data: dict[str, Any], base: Config | None = None) -> Config:
+    """``base`` (the defaults) with nested mappings of changes. Raises ConfigError for unknown keys and wrong types."""
+    return _merged(base or Config(), data)
 
 
 def preset(name: str) -> Config:
@@ -234,15 +234,15 @@ def preset(name: str) -> Config:
     return config
 
 
-def config_from_yaml(path: Path) -> Config:
-    """Read a YAML file of overrides. Raises ConfigError."""
+def config_from_yaml(path: Path, base: Config | None = None) -> Config:
+    """Read a YAML file of overrides of ``base`` (the defaults). Raises ConfigError."""
     try:
         data = yaml.safe_load(path.read_text()) or {}
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
         raise ConfigError(f"config file {path}: expected readable YAML, got {_one_line(e)}") from e
     if not isinstance(data, dict):
         raise ConfigError(f"config file {path}: expected key: value pairs, got {type(data).__name__}")
-    return config_from_dict(data)
+    return config_from_dict(data, base)
 
 
 def with_override(config: Config, dotted: str) -> Config:

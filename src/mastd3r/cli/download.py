@@ -32,7 +32,8 @@ def download_parser(p: argparse.ArgumentParser) -> None:
 def _download(args: argparse.Namespace, console: Console) -> int:
     from ..download.datasets import dataset_of, download, kept_archives
     from ..download.fetch import human_bytes
-    from ..progress import FileBars, Silent, Terminal
+    from ..progress import FileBars, Silent
+    from .terminal import Terminal
 
     out = Console()
     if args.dataset == LIST:

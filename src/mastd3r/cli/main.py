@@ -16,7 +16,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads must not eat the cores
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the solvers' matrices are small: threads only wait
     from ..errors import SlamError
-    from .commands import dispatch
+    from .dispatch import dispatch
 
     words = list(sys.argv[1:] if argv is None else argv)
     try:

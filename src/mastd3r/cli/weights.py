@@ -55,7 +55,8 @@ def _list(args: argparse.Namespace, console: Console) -> int:
 def _download(args: argparse.Namespace, console: Console) -> int:
     from ..download.weights_download import download
     from ..download.weights_known import KNOWN
-    from ..progress import FileBars, Silent, Terminal
+    from ..progress import FileBars, Silent
+    from .terminal import Terminal
 
     with FileBars(Silent() if args.quiet else Terminal(console)) as bars:
         got = download(args.what, _accept(args.yes, console), as_name=args.as_name, watch=bars.watch)

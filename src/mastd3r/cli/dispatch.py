@@ -1,0 +1,33 @@
+"""Words in, one command run, its exit code out."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+
+from rich.console import Console
+from rich.logging import RichHandler
+
+from .parser import parser
+
+
+def dispatch(words: list[str]) -> int:
+    """Parse and run one command; returns the exit code."""
+    args = parser().parse_args(words)
+    console = Console(stderr=True)
+    logging.basicConfig(
+        level=_log_level(args),
+        format="%(message)s",
+        handlers=[RichHandler(console=console, show_path=False, show_time=False)],
+        force=True,
+    )
+    args.words = ["mastd3r", *words]
+    code: int = args.act(args, console)
+    return code
+
+
+def _log_level(args: argparse.Namespace) -> int:
+    """--quiet leaves stderr to the one line that says why a run failed; run.json has the warnings."""
+    if args.verbose:
+        return logging.INFO
+    return logging.CRITICAL if getattr(args, "quiet", False) else logging.WARNING

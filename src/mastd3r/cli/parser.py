@@ -1,0 +1,134 @@
+"""The words of the command line: commands, options, their texts; choices are those of the registries."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn, get_args
+
+from .. import __version__
+from ..config import PRESETS, Config, MapLossKind, SourceKind, config_from_yaml, preset, with_override
+from ..errors import ConfigError
+from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
+from . import commands
+from .bench import bench_parser
+from .download import download_parser
+from .weights import weights_parser
+
+INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, as everything else does."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message}; see {self.prog} --help")
+
+
+def parser() -> argparse.ArgumentParser:
+    top = _Parser(prog="mastd3r", description="Trajectory, static map and clean splat from a video.")
+    top.add_argument("--version", action="version", version=__version__)
+    top.add_argument("-v", "--verbose", action="store_true", help="say more")
+    known = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _run_parser(known.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
+    demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
+    demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
+    demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
+    demo.set_defaults(act=commands.demo)
+    _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
+    export = known.add_parser("export", help="write a run's trajectory or splat in another format")
+    export.add_argument("run", type=Path, help="run folder")
+    export.add_argument(
+        "--to", choices=("tum", "kitti", "colmap", "spz", "flight", "depth"), required=True, help="the format"
+    )
+    export.add_argument(
+        "--out", type=Path, required=True, help="file (tum, kitti, spz, flight: .mp4) or folder (colmap, depth)"
+    )
+    export.set_defaults(act=commands.export)
+    view = known.add_parser("view", help="open a run's report in the browser")
+    view.add_argument("run", type=Path, help="run folder")
+    view.set_defaults(act=commands.view)
+    bench_parser(known.add_parser("bench", help="run a suite of experiments and make its tables"))
+    weights_parser(known.add_parser("weights", help="list, download and check the weights of the networks"))
+    download_parser(known.add_parser("download", help="list and bring the public datasets"))
+    doctor = known.add_parser("doctor", help="what this machine has, and what runs would choose")
+    doctor.set_defaults(act=commands.doctor)
+    return top
+
+
+def _eval_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("paths", type=Path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
+    p.add_argument("--trajectory", type=Path, metavar="FILE", help="poses that another system has written")
+    p.add_argument("--format", choices=("tum", "kitti", "euroc"), help="of that file")
+    p.add_argument("--out", type=Path, metavar="FILE", help="with --trajectory: write the figures as JSON")
+    p.set_defaults(act=commands.evaluate_run)
+
+
+def _run_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("source", type=Path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
+    p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
+    p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once; paper: everything as printed")
+    p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
+    p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
+    p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
+    p.add_argument("--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp")
+    p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
+    p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
+    p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
+    p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
+    p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")
+    p.add_argument("--realtime", action="store_true", help="start the map while tracking, in a process of its own")
+    p.add_argument("--start", type=int, help="first frame, from 0")
+    p.add_argument("--end", type=int, help="one past the last frame")
+    p.add_argument("--stride", type=int, help="every n-th frame")
+    p.add_argument("--seed", type=int, help="of everything that is drawn at random (default 0)")
+    p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
+    p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs of a bench
+    p.set_defaults(act=commands.run)
+
+
+def _listed(registry: Registry) -> str:
+    """The parts of a registry, for people."""
+    return "; ".join(f"{e.name}: {e.summary}" for e in registry.entries()).replace("%", "%%")
+
+
+def config_from_args(args: argparse.Namespace) -> Config:
+    """Defaults, then the preset, the file, --set, and the named options."""
+    config = preset(args.preset) if args.preset else Config()
+    if args.config:
+        config = config_from_yaml(args.config, config)
+    for item in args.set:
+        config = with_override(config, item)
+    for name in ("pointmaps", "semantics", "correction", "seed"):
+        if getattr(args, name) is not None:
+            config = replace(config, **{name: getattr(args, name)})
+    window = {k: getattr(args, k) for k in ("start", "end", "stride", "kind") if getattr(args, k) is not None}
+    config = replace(config, source=replace(config.source, **window))
+    if args.map_loss is not None:
+        config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
+    if args.realtime and args.no_map:
+        raise ConfigError("--realtime: expected a map to be made, got --no-map")
+    if args.realtime:
+        config = replace(config, mapping=replace(config.mapping, realtime=True))
+    if args.no_map:
+        config = replace(config, mapping=replace(config.mapping, enabled=False))
+    if args.maps is not None and config.semantics == "auto":
+        config = replace(config, semantics="maps")
+    if args.intrinsics == "dataset":
+        config = replace(config, camera=replace(config.camera, intrinsics=(), from_dataset=True))
+    elif args.intrinsics is not None:
+        given = _numbers(args.intrinsics)
+        config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
+    return config
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(x) for x in text.replace(",", " ").split())
+    except ValueError as e:
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got {text!r}") from e
+    if not numbers:
+        raise ConfigError("--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got nothing")
+    return numbers
