@@ -61,7 +61,11 @@ class Registry:
         try:
             yield
         finally:
-            del self._entries[name]
+            self.remove(name)
+
+    def remove(self, name: str) -> None:
+        """Forget a part. Raises KeyError for one that is not there."""
+        del self._entries[name]
 
     @property
     def choices(self) -> tuple[str, ...]:
