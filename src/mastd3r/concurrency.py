@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +14,7 @@ from contextlib import contextmanager
 from functools import cache
 from typing import Any, Generic, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 T = TypeVar("T")
 C = TypeVar("C")
@@ -88,23 +89,39 @@ def prefetch(items: Iterator[T], work: Callable[[T, C], None], context: Callable
 
 
 class _BlasLimit:
-    """Holds BLAS to one thread while anybody is inside, in whichever order they come and go."""
+    """Holds BLAS to one thread for whoever is inside, in whichever order they come and go.
+
+    Some builds of OpenBLAS keep the number for every calling thread, others for the process: what one thread found is
+    given back in that thread, and the last one out leaves what there was before the first.
+    """
 
     def __init__(self) -> None:
         self._lock, self._inside = threading.Lock(), 0
-        self._limits: Any = None
+        self._first: list[int] = []  # threads of the libraries before anybody was inside
+        self._libraries: list[Any] = []
+        self._modules = 0  # there were when the libraries were looked for, which takes 3 ms
 
-    def enter(self) -> None:
+    def enter(self) -> tuple[list[Any], list[int]]:
+        """The libraries, and the threads that they had for this caller."""
         with self._lock:
+            if self._modules != len(sys.modules):  # whoever brings another library has imported something
+                self._modules = len(sys.modules)
+                self._libraries = ThreadpoolController().select(user_api="blas").lib_controllers
+            libraries = self._libraries
+            found = [library.num_threads for library in libraries]
+            if self._inside == 0:
+                self._first = found
             self._inside += 1
-            if self._inside == 1:
-                self._limits = threadpool_limits(limits=1, user_api="blas")
+            for library in libraries:
+                library.set_num_threads(1)
+            return libraries, found
 
-    def leave(self) -> None:
+    def leave(self, libraries: list[Any], found: list[int]) -> None:
         with self._lock:
             self._inside -= 1
-            if self._inside == 0:
-                self._limits.restore_original_limits()
+            before = self._first if self._inside == 0 and len(self._first) == len(found) else found
+            for library, threads in zip(libraries, before, strict=True):
+                library.set_num_threads(threads)
 
 
 _BLAS = _BlasLimit()
@@ -117,11 +134,11 @@ def one_blas_thread() -> Iterator[None]:
     Our products are small and many: BLAS's own threads would spin between them on the cores that our threads need,
     which costs more than half of the processor's time on two cores.
     """
-    _BLAS.enter()
+    entered = _BLAS.enter()
     try:
         yield
     finally:
-        _BLAS.leave()
+        _BLAS.leave(*entered)
 
 
 S = TypeVar("S")
