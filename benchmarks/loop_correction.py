@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mastd3r.reconstruct import MapMaterial
 
 from map_losses import Pictures, clean_pictures, material
 from mastd3r.concurrency import one_blas_thread
@@ -29,8 +30,8 @@ from mastd3r.evaluation.image_error import psnr
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.trajectory_files import read_tum
+from mastd3r.mapping.correction import changes_of
 from mastd3r.mapping.mapper import Mapper
-from mastd3r.reconstruct import MapMaterial
 from mastd3r.sources import open_source
 
 SEQUENCE, MOVED_M, BOUND_DB = "kitchen", 0.05, 0.5
@@ -87,7 +88,7 @@ def with_tracked_poses(mapper: Mapper) -> Mapper:
 def by_anchors(mapper: Mapper, drift: dict[int, np.ndarray], right: dict[int, np.ndarray]) -> Mapper:
     """A copy that only draws, every Gaussian moved with its anchor. It shares exposures and poses with ``mapper``."""
     other = copy(mapper)
-    other._map = mapper._map.moved(drift, right)
+    other._map = mapper._map.moved(changes_of(drift, right))
     return other
 
 

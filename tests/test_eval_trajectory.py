@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from mastd3r.cli.main import main
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.formats import kitti_text
-from mastd3r.export.trajectory_files import quaternion_from_rotation, read_trajectory, read_tum, write_tum
+from mastd3r.export.trajectory_files import read_trajectory, read_tum, write_tum
+from mastd3r.geometry.quaternion import quaternion_from_rotation
 from mastd3r.types import Trajectory
 
 N = 24  # frames of the room clip

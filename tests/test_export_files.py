@@ -6,34 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
 from mastd3r.export.point_cloud import read_cloud, read_vertices, write_cloud
-from mastd3r.export.trajectory_files import quaternion_from_rotation, read_tum, rotation_from_quaternion, write_tum
+from mastd3r.export.trajectory_files import read_tum, write_tum
 from mastd3r.types import StaticCloud, Trajectory
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    axis=st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda a: np.linalg.norm(a) > 1e-3),
-    angle=st.one_of(st.floats(-7, 7), st.sampled_from([0.0, 1e-12, 1e-8, np.pi, np.pi - 1e-9, np.pi + 1e-9])),
-)
-def test_quaternions_hold_at_every_angle(axis: tuple[float, float, float], angle: float) -> None:
-    rotation = Rotation.from_rotvec(np.array(axis) / np.linalg.norm(axis) * angle).as_matrix()
-    wxyz = quaternion_from_rotation(rotation[None])
-    assert np.linalg.norm(wxyz) == pytest.approx(1, abs=1e-12)
-    assert wxyz[0, 0] >= 0
-    assert np.allclose(rotation_from_quaternion(wxyz)[0], rotation, atol=1e-12)
-    assert np.allclose(Rotation.from_quat(wxyz[0, [1, 2, 3, 0]]).as_matrix(), rotation, atol=1e-12)
-
-
-def test_half_turns_about_the_axes() -> None:
-    turns = np.stack([np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1]), np.eye(3)])
-    wanted = [[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [1, 0, 0, 0]]
-    assert np.allclose(np.abs(quaternion_from_rotation(turns)), wanted)
 
 
 def test_trajectory_comes_back(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mastd3r.geometry.quaternion import quaternion_from_rotation
 from mastd3r.geometry.se3 import (
     adjoint,
     hat,
@@ -21,7 +22,6 @@ from mastd3r.geometry.se3 import (
     so3_exp,
     so3_log,
     transform,
-    wxyz_from_rotation,
 )
 from mastd3r.geometry.sim3 import Sim3, procrustes
 
@@ -84,7 +84,7 @@ def test_near_half_a_turn(axis: Array, short: float) -> None:
 def test_exactly_half_a_turn(axis: Array) -> None:
     rotation = 2 * np.outer(axis, axis) - np.eye(3)
     np.testing.assert_allclose(np.abs(so3_log(rotation)), np.pi * axis, atol=1e-12)
-    np.testing.assert_allclose(wxyz_from_rotation(rotation), np.r_[0, axis], atol=1e-12)
+    np.testing.assert_allclose(quaternion_from_rotation(rotation), np.r_[0, axis], atol=1e-12)
 
 
 @QUICK
@@ -135,6 +135,8 @@ def test_similarities_are_a_group_that_acts_on_points(a: Sim3, b: Sim3, c: Sim3,
     same = a @ Sim3.identity()
     np.testing.assert_allclose(same.apply(x), a.apply(x), atol=1e-12)
     np.testing.assert_allclose(Sim3.from_rigid(a.rigid, a.scale).apply(x), a.apply(x), atol=1e-12)
+    np.testing.assert_allclose(transform(a.matrix, x), a.apply(x), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(a.in_lengths(3.0).apply(x), 3 * a.apply(x), rtol=1e-12, atol=1e-12)
 
 
 @QUICK

@@ -279,7 +279,7 @@ def test_fixed_intrinsics_stay(exact_scene: Callable[..., Any]) -> None:
     assert (lens.values == before).all()
     half = Intrinsics(before.copy(), before, np.array([1e-6, *[np.inf] * 5]))
     solve(blocks_of(scene), edges_of(scene, 0.2), half, fixed=frozenset([0]), iterations=15)
-    assert half.g[0] != before[0] and (half.g[1:] == before[1:]).all()
+    assert half.values[0] != before[0] and (half.values[1:] == before[1:]).all()
 
 
 def test_measured_depths_fix_the_scale(exact_scene: Callable[..., Any]) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mastd3r.alignment.result import Alignment
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
-from mastd3r.geometry.sim3 import procrustes
+from mastd3r.geometry.sim3 import Sim3, procrustes
 from mastd3r.graph.covisibility import overlap, overlaps
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
@@ -55,6 +55,11 @@ def drifted(scene: Any, scale: float = DRIFT, turn: Array | None = None) -> tupl
     return graph, centres
 
 
+def loop_of(scene: Any, i: int, j: int, scale: float) -> Loop:
+    """The exact loop, where the lengths around j are ``scale`` times those around i."""
+    return Loop(i, j, Sim3.from_rigid(scene.j_from_i(i, j)).in_lengths(scale), 300.0)
+
+
 def off(graph: KeyframeGraph, centres: Array) -> float:
     """RMSE of the keyframes' centres after Sim(3) alignment, relative to the size of the path."""
     found = np.stack([graph.world_from_cam(k)[:3, 3] for k in range(VIEWS)])
@@ -76,7 +81,7 @@ def test_drift_goes_to_the_weak_link(scene: Any, turn: Array | None) -> None:
     i, j = 1, VIEWS - 2
     first = graph.variables[0].cam_from_world.copy()
     depths = [graph.median_inv_depth(k) for k in range(VIEWS)]
-    optimise_pose_graph(graph, [Loop(i, j, scene.j_from_i(i, j), 1 / DRIFT, 300.0)])
+    optimise_pose_graph(graph, [loop_of(scene, i, j, DRIFT)])
     assert off(graph, centres) < 0.01
     np.testing.assert_array_equal(graph.variables[0].cam_from_world, first)
     for k in range(VIEWS):
@@ -90,7 +95,7 @@ def test_frames_are_stretched_with_their_keyframe(scene: Any) -> None:
     graph, _ = drifted(scene)
     graph.records[9].cam_from_kf = se3_exp(np.array([0.2, 0.1, 0.3, 0.0, 0.1, 0.0]))
     before = graph.records[9].cam_from_kf.copy()
-    optimise_pose_graph(graph, [Loop(1, VIEWS - 2, scene.j_from_i(1, VIEWS - 2), 1 / DRIFT, 300.0)])
+    optimise_pose_graph(graph, [loop_of(scene, 1, VIEWS - 2, DRIFT)])
     np.testing.assert_allclose(graph.records[9].cam_from_kf[:3, 3], before[:3, 3] / DRIFT, rtol=0.01)
     np.testing.assert_array_equal(graph.records[9].cam_from_kf[:3, :3], before[:3, :3])
 
@@ -98,7 +103,7 @@ def test_frames_are_stretched_with_their_keyframe(scene: Any) -> None:
 def test_a_chain_that_already_agrees_stays(scene: Any) -> None:
     graph, _ = drifted(scene, scale=1.0)
     poses = [graph.variables[k].cam_from_world.copy() for k in range(VIEWS)]
-    optimise_pose_graph(graph, [Loop(2, 9, scene.j_from_i(2, 9), 1.0, 250.0)])
+    optimise_pose_graph(graph, [loop_of(scene, 2, 9, 1.0)])
     for k, pose in enumerate(poses):
         np.testing.assert_allclose(graph.variables[k].cam_from_world, pose, atol=1e-6)
 
@@ -171,7 +176,7 @@ def test_a_loop_is_seen_both_ways_and_closed(scene: Any) -> None:
     front = Recognises(scene, graph, (2, 9))
     assert off(graph, centres) > 0.1
     (loop,) = close_loops(front, graph, front)  # type: ignore[arg-type]
-    assert (loop.i, loop.j) == (2, 9) and loop.scale == pytest.approx(1 / DRIFT, rel=0.02)
+    assert (loop.i, loop.j) == (2, 9) and loop.j_from_i.scale == pytest.approx(DRIFT, rel=0.02)
     assert front.compared == [(2, 9), (9, 2)] and graph.connected(2, 9)
     assert off(graph, centres) < 0.02
 

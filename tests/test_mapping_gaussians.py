@@ -8,9 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
+from mastd3r.geometry.sim3 import Sim3
 from mastd3r.mapping.adam import RowAdam
+from mastd3r.mapping.correction import changes_of
 from mastd3r.mapping.densify import DensifyPolicy, DensifySettings
-from mastd3r.mapping.gaussians import GaussianMap, quaternion_from_rotation
+from mastd3r.mapping.gaussians import GaussianMap
 from mastd3r.mapping.screen import ScreenStats
 from mastd3r.mapping.seed import seed_gaussians
 from mastd3r.types import StaticCloud
@@ -83,7 +85,7 @@ def test_a_keyframe_correction_moves_map_and_view_together() -> None:
     gaussians = random_map()
     gaussians.kf_id[:] = 7
     old, new = motion((0.1, 0, 0.2), (0.5, 0, 0)), motion((-0.3, 0.5, 0.1), (0.1, 2, -1))
-    moved = gaussians.moved({7: old}, {7: new})
+    moved = gaussians.moved(changes_of({7: old}, {7: new}))
     world_from_cam = motion((0, 0.05, 0), (0.02, 0, 0))
     before = draw(gaussians, np.linalg.inv(world_from_cam))
     after = draw(moved, np.linalg.inv(new @ np.linalg.inv(old) @ world_from_cam))
@@ -93,8 +95,7 @@ def test_a_keyframe_correction_moves_map_and_view_together() -> None:
 
 def test_only_the_corrected_keyframes_gaussians_move() -> None:
     gaussians = random_map()
-    identity = {0: np.eye(4), 1: np.eye(4), 2: np.eye(4)}
-    moved = gaussians.moved(identity, {**identity, 1: motion((0, 0, 0), (0.05, 0, 0))})
+    moved = gaussians.moved({1: Sim3(np.eye(3), np.array([0.05, 0, 0]))})
     change = (moved.means - gaussians.means).detach().norm(dim=1)
     assert torch.allclose(change[gaussians.kf_id == 1], torch.tensor(0.05), atol=1e-6)
     assert torch.all(change[gaussians.kf_id != 1] == 0)
@@ -103,17 +104,9 @@ def test_only_the_corrected_keyframes_gaussians_move() -> None:
 def test_a_correction_with_scale_scales_the_gaussians() -> None:
     gaussians = random_map()
     gaussians.kf_id[:] = 0
-    scaled = np.diag([1.7, 1.7, 1.7, 1.0])
-    moved = gaussians.moved({0: np.eye(4)}, {0: scaled})
+    moved = gaussians.moved({0: Sim3.identity().in_lengths(1.7)})
     assert torch.allclose(moved.means, 1.7 * gaussians.means, atol=1e-5)
     assert torch.allclose(moved.log_scales.exp(), 1.7 * gaussians.log_scales.exp(), rtol=1e-4)
-
-
-@pytest.mark.parametrize("turn", [(0, 0, 0), (3.14159, 0, 0), (0, 2.2, 2.2), (1e-9, 0, 0), (0.3, -0.2, 1)])
-def test_quaternion_of_a_rotation(turn: tuple[float, float, float]) -> None:
-    matrix = Rotation.from_rotvec(turn).as_matrix()
-    w, x, y, z = quaternion_from_rotation(matrix)
-    assert np.allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), matrix, atol=1e-9)
 
 
 def observed(gaussians: GaussianMap, grad: torch.Tensor, radius: int, **settings: float) -> DensifyPolicy:

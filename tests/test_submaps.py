@@ -11,11 +11,11 @@ import pytest
 from numpy.typing import NDArray
 
 from mastd3r.config import CameraConfig, Config, GraphConfig, TrackingConfig
-from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
+from mastd3r.geometry.se3 import inverse, se3_exp, se3_log, transform
 from mastd3r.geometry.sim3 import Sim3, procrustes
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.submaps import bridge_submaps, join, scale_between
+from mastd3r.graph.submaps import bridge_submaps, join, with_scale
 from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph
 from mastd3r.parts import Parts, build_parts
 from mastd3r.slam import Slam, TrackResult
@@ -101,8 +101,11 @@ def test_the_scale_between_two_submaps(scene: Any, i: int, j: int, scale: float)
     """To 1 %, though the depths compared are of the nearest cell and not of the same pixel."""
     graph = cut_graph(scene, scale)
     matches = scene.matches(i, j, 0.3)
-    found = scale_between(graph, i, j, scene.j_from_i(i, j), matches, matches.weight)
-    assert found == pytest.approx(scale, rel=0.01)
+    found = with_scale(graph, i, j, scene.j_from_i(i, j), matches, matches.weight)
+    assert found is not None and 1 / found.scale == pytest.approx(scale, rel=0.01)
+    np.testing.assert_allclose(
+        found.apply(scene.points(i)), transform(scene.j_from_i(i, j), scene.points(i)) / scale, rtol=0.02
+    )
 
 
 def test_a_third_of_wrong_matches_does_not_move_the_scale(scene: Any) -> None:
@@ -110,21 +113,21 @@ def test_a_third_of_wrong_matches_does_not_move_the_scale(scene: Any) -> None:
     wrong = np.random.default_rng(0).random(len(scene.px)) < 0.33
     graph.variables[4].inv_depth = np.where(wrong, 0.3, 1.0) * graph.variables[4].inv_depth
     graph.variables[4].depth_info = graph.variables[4].depth_info * 100
-    found = scale_between(graph, 4, 5, scene.j_from_i(4, 5), matches, matches.weight)
-    assert found == pytest.approx(SCALE, rel=0.05)
+    found = with_scale(graph, 4, 5, scene.j_from_i(4, 5), matches, matches.weight)
+    assert found is not None and 1 / found.scale == pytest.approx(SCALE, rel=0.05)
 
 
 def test_no_scale_where_too_little_is_known(scene: Any) -> None:
     matches = scene.matches(4, 5)
     args = scene.j_from_i(4, 5), matches
-    assert scale_between(cut_graph(scene), 4, 5, *args, np.zeros(len(scene.px))) is None
+    assert with_scale(cut_graph(scene), 4, 5, *args, np.zeros(len(scene.px))) is None
     for unknown in (4, 5):
         graph = cut_graph(scene)
         graph.variables[unknown].depth_info = np.zeros(len(scene.px))
         graph.variables[unknown].prior_info = np.full(len(scene.px), 1e-6)
-        assert scale_between(graph, 4, 5, *args, matches.weight) is None
+        assert with_scale(graph, 4, 5, *args, matches.weight) is None
     few = matches.weight * (np.cumsum(matches.weight) <= 19)
-    assert scale_between(cut_graph(scene), 4, 5, *args, few) is None
+    assert with_scale(cut_graph(scene), 4, 5, *args, few) is None
 
 
 @pytest.mark.parametrize("current", [0, 1])
@@ -133,7 +136,7 @@ def test_joining_puts_everything_where_it_belongs(scene: Any, current: int) -> N
     graph.submap = current
     info = graph.variables[7].depth_info.copy() * graph.variables[7].inv_depth ** 2
     graph.variables[8].prior_depth = 1.1 * graph.variables[8].inv_depth
-    join(graph, 3, 6, scene.j_from_i(3, 6), SCALE)
+    join(graph, 3, 6, Sim3.from_rigid(scene.j_from_i(3, 6)).in_lengths(1 / SCALE))
     for k in range(VIEWS):
         np.testing.assert_allclose(graph.world_from_cam(k), world_from(scene, k), atol=1e-6)
         np.testing.assert_allclose(graph.variables[k].inv_depth, 1 / scene.depth(k), rtol=1e-9)
@@ -153,7 +156,7 @@ def test_a_join_changes_no_residual_within_either_part(scene: Any) -> None:
     graph = cut_graph(scene)
     assert graph.solve_all(1, 1.0).cost_first < 1e-3
     graph = cut_graph(scene)
-    join(graph, 3, 6, scene.j_from_i(3, 6), SCALE)
+    join(graph, 3, 6, Sim3.from_rigid(scene.j_from_i(3, 6)).in_lengths(1 / SCALE))
     assert graph.solve_all(1, 1.0).cost_first < 1e-3
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..geometry.least_squares import damped_solve
+from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.point_kernels import point_system
 from ..geometry.reprojection_kernels import pose_system
 from ..geometry.se3 import se3_exp, transform
@@ -66,6 +67,67 @@ class _Neighbours:
         return self._pairs
 
 
+@dataclass(frozen=True)
+class _Terms:
+    """What eq. (12) is a sum of."""
+
+    matches: StaticMatches
+    own: OwnPoints | None
+    chamfer_weight: float
+    kernel_px: float
+    as_printed: bool
+    near: _Neighbours
+
+    def system(self, pose: Array, log_scale: float) -> tuple[Array, Array, float]:
+        """Normal equations (7, 7), (7,) and cost."""
+        hess, rhs, cost = np.zeros((7, 7)), np.zeros(7), 0.0
+        if self.own is None or not self.as_printed:
+            m = self.matches
+            args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
+            hess[:6, :6], rhs[:6], cost = pose_system(*args, pose, m.lens, self.kernel_px)
+        if self.own is None:
+            return hess, rhs, cost
+        for h, b, c in self._points(self.own, pose, log_scale):
+            hess, rhs, cost = hess + h, rhs + b, cost + c
+        if self.as_printed:
+            hess[6], hess[:, 6], rhs[6] = 0.0, 0.0, 0.0
+            hess[6, 6] = 1.0
+        return hess, rhs, cost
+
+    def _points(self, own: OwnPoints, pose: Array, log_scale: float) -> list[tuple[Array, Array, float]]:
+        """Point to point, and Chamfer."""
+        used = own.weight > 0.05
+        moved, scaled, w = transform(pose, own.ref[used]), np.exp(log_scale) * own.new[used], own.weight[used]
+        sigma = own.sigma_ratio * np.maximum(scaled[:, 2], 1e-6)
+        parts = [point_terms(moved, scaled, w, sigma)]
+        if self.chamfer_weight > 0 and used.sum() > 10:
+            i, j = self.near.of(moved, scaled, sigma)
+            parts.append(point_terms(moved[i], scaled[j], self.chamfer_weight * np.minimum(w[i], w[j]), sigma[j]))
+        return parts
+
+
+@dataclass(frozen=True)
+class _PoseAndScale:
+    """The solver's estimate; the kernels give the cost with the system."""
+
+    terms: _Terms
+    new_from_ref: Array
+    log_scale: float
+
+    @cached_property
+    def _system(self) -> tuple[Array, Array, float]:
+        return self.terms.system(self.new_from_ref, self.log_scale)
+
+    def linearised(self) -> tuple[Array, Array, float]:
+        return self._system
+
+    def cost(self) -> float:
+        return self._system[2]
+
+    def moved(self, step: Array) -> _PoseAndScale:
+        return _PoseAndScale(self.terms, se3_exp(step[:6]) @ self.new_from_ref, self.log_scale + float(step[6]))
+
+
 def align_fine(
     matches: StaticMatches,
     own: OwnPoints | None,
@@ -82,62 +144,9 @@ def align_fine(
     Without own points the sum is the re-mapping term alone, on SE(3). ``as_printed``: where there are own points,
     the sum is theirs alone, and the scale stays as the stage before left it: T of eq. (11) is in SE(3).
     """
-    pose, damping, converged, done = new_from_ref, 1e-4, False, 0
-    log_scale = float(np.log(scale))
-    near = _Neighbours()
-    fixed = (kernel_px, near, as_printed)
-    state = _system(matches, own, pose, log_scale, chamfer_weight, *fixed)
-    for done in range(1, iterations + 1):
-        step = damped_solve(state[0], state[1], damping)
-        if step is None or damping > 1e4:
-            break
-        trial_pose, trial_log = se3_exp(step[:6]) @ pose, log_scale + float(step[6])
-        trial = _system(matches, own, trial_pose, trial_log, chamfer_weight, *fixed)
-        if trial[2] > state[2] * (1 + 1e-9):
-            damping *= 10
-            continue
-        damping = max(damping * 0.2, 1e-8)
-        converged = state[2] - trial[2] < 1e-5 * max(state[2], 1e-12)
-        pose, log_scale, state = trial_pose, trial_log, trial
-        if converged:
-            break
-    return PoseReport(pose, state[0][:6, :6], done, converged), float(np.exp(log_scale))
-
-
-def _system(
-    matches: StaticMatches,
-    own: OwnPoints | None,
-    pose: Array,
-    log_scale: float,
-    chamfer_weight: float,
-    kernel_px: float,
-    near: _Neighbours,
-    as_printed: bool,
-) -> tuple[Array, Array, float]:
-    hess, rhs, cost = np.zeros((7, 7)), np.zeros(7), 0.0
-    if own is None or not as_printed:
-        hess[:6, :6], rhs[:6], cost = pose_system(
-            matches.px,
-            matches.inv_depth,
-            matches.depth_info,
-            matches.target,
-            matches.weight,
-            pose,
-            matches.lens,
-            kernel_px,
-        )
-    if own is None:
-        return hess, rhs, cost
-    used = own.weight > 0.05
-    moved, scaled, w = transform(pose, own.ref[used]), np.exp(log_scale) * own.new[used], own.weight[used]
-    sigma = own.sigma_ratio * np.maximum(scaled[:, 2], 1e-6)
-    parts = [point_terms(moved, scaled, w, sigma)]
-    if chamfer_weight > 0 and used.sum() > 10:
-        i, j = near.of(moved, scaled, sigma)
-        parts.append(point_terms(moved[i], scaled[j], chamfer_weight * np.minimum(w[i], w[j]), sigma[j]))
-    for h, b, c in parts:
-        hess, rhs, cost = hess + h, rhs + b, cost + c
-    if as_printed:
-        hess[6], hess[:, 6], rhs[6] = 0.0, 0.0, 0.0
-        hess[6, 6] = 1.0
-    return hess, rhs, cost
+    terms = _Terms(matches, own, chamfer_weight, kernel_px, as_printed, _Neighbours())
+    start = _PoseAndScale(terms, new_from_ref, float(np.log(scale)))
+    found = levenberg_marquardt(start, Damping(), iterations=iterations, tolerance=1e-5)
+    end = found.estimate
+    report = PoseReport(end.new_from_ref, end.linearised()[0][:6, :6], found.iterations, found.converged)
+    return report, float(np.exp(end.log_scale))

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.least_squares import damped_solve
+from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.reprojection_kernels import MIN_DEPTH, edge_residuals, pose_system
 from ..geometry.se3 import se3_exp
 
@@ -63,24 +64,35 @@ class PoseReport:
     converged: bool
 
 
+@dataclass(frozen=True)
+class _Pose:
+    """A pose as the solver's estimate; the kernel gives the cost with the system."""
+
+    matches: StaticMatches
+    kernel_px: float
+    new_from_ref: Array
+
+    @cached_property
+    def _system(self) -> tuple[Array, Array, float]:
+        m = self.matches
+        args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
+        found: tuple[Array, Array, float] = pose_system(*args, self.new_from_ref, m.lens, self.kernel_px)
+        return found
+
+    def linearised(self) -> tuple[Array, Array, float]:
+        return self._system
+
+    def cost(self) -> float:
+        return self._system[2]
+
+    def moved(self, step: Array) -> _Pose:
+        return _Pose(self.matches, self.kernel_px, se3_exp(step) @ self.new_from_ref)
+
+
 def solve_pose(matches: StaticMatches, new_from_ref: Array, *, kernel_px: float, iterations: int = 20) -> PoseReport:
     """Levenberg-Marquardt on SE(3); each depth is marginalised under its own information, so that a point
     without depth still fixes rotation and the direction across its epipolar line."""
-    args = (matches.px, matches.inv_depth, matches.depth_info, matches.target, matches.weight)
-    pose, damping, converged, done = new_from_ref, 1e-4, False, 0
-    hess, rhs, cost = pose_system(*args, pose, matches.lens, kernel_px)
-    for done in range(1, iterations + 1):
-        step = damped_solve(hess, rhs, damping)
-        if step is None or damping > 1e4:
-            break
-        trial_pose = se3_exp(step) @ pose
-        trial = pose_system(*args, trial_pose, matches.lens, kernel_px)
-        if trial[2] > cost * (1 + 1e-9):
-            damping *= 10
-            continue
-        damping = max(damping * 0.2, 1e-8)
-        converged = cost - trial[2] < 1e-5 * max(cost, 1e-12)
-        pose, (hess, rhs, cost) = trial_pose, trial
-        if converged:
-            break
-    return PoseReport(pose, hess, done, converged)
+    start = _Pose(matches, kernel_px, new_from_ref)
+    found = levenberg_marquardt(start, Damping(), iterations=iterations, tolerance=1e-5)
+    pose = found.estimate
+    return PoseReport(pose.new_from_ref, pose.linearised()[0], found.iterations, found.converged)

@@ -13,29 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.sim3 import Sim3
 from ..types import Trajectory, Truth
 
 Array = NDArray[Any]
 ASSOCIATION_S = 0.02  # a pose and a true pose that are further apart in time are no pair
 MIN_POSES = 4  # a Sim(3) has seven degrees of freedom: three points fit far too well to be an error
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """target = scale * rotation @ source + translation."""
-
-    rotation: Array  # (3, 3) float64, det +1
-    translation: Array  # (3,) float64, the target's unit
-    scale: float
-
-    def apply(self, points: Array) -> Array:
-        """(..., 3) source points to target points."""
-        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
-
-    def inverse(self) -> Similarity:
-        """The map from target to source. Needs scale > 0."""
-        back = self.rotation.T
-        return Similarity(back, -back @ self.translation / self.scale, 1.0 / self.scale)
 
 
 @dataclass(frozen=True)
@@ -48,7 +31,7 @@ class AteResult:
     max: float | None = None
     n_associated: int = 0
     scale: float | None = None  # truth's unit per map unit
-    truth_from_map: Similarity | None = None
+    truth_from_map: Sim3 | None = None
     rows: Array | None = None  # (n_associated,) rows of the estimate
     times_s: Array | None = None  # (n_associated,) their times
     aligned: Array | None = None  # (n_associated, 3) estimated positions in the truth's frame
@@ -84,7 +67,7 @@ class RpeResult:
     reason: str | None = None
 
 
-def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity:
+def umeyama(source: Array, target: Array, with_scale: bool = True) -> Sim3:
     """Least-squares similarity from paired points, Umeyama eqs. (40)-(42).
 
     ``source`` and ``target`` are (n, 3), n >= 1, finite. Points on one line leave the turn about that line
@@ -98,7 +81,7 @@ def umeyama(source: Array, target: Array, with_scale: bool = True) -> Similarity
     rotation = (u * sign) @ vt
     spread = float((centred**2).sum())
     scale = float(singular @ sign) / spread if with_scale and spread > 0 else 1.0
-    return Similarity(rotation, target_mean - scale * rotation @ source_mean, scale)
+    return Sim3(rotation, target_mean - scale * rotation @ source_mean, scale)
 
 
 def associate(times_s: Array, truth_s: Array, tolerance_s: float) -> tuple[Array, Array]:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..errors import ConfigError, InputError
+from ..geometry.quaternion import quaternion_from_rotation
 from ..geometry.se3 import inverse
 from ..types import Trajectory
 from .files import write_bytes, write_text, writing
 from .point_cloud import read_cloud
 from .read_run import Run, read_run
 from .run_folder import stamp
-from .trajectory_files import quaternion_from_rotation
 
 Array = NDArray[Any]
 ExportKind = Literal["tum", "kitti", "colmap"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError, InputError
+from ..geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
 from ..types import State, Trajectory
 from .files import write_text
 
@@ -112,39 +113,3 @@ def _in_order(times_s: Array, positions: Array, rotations: Array, state: State) 
     poses = np.tile(np.eye(4), (len(order), 1, 1))
     poses[:, :3, 3], poses[:, :3, :3] = positions[order], rotations[order]
     return Trajectory(times_s[order], poses, (state,) * len(order), np.zeros(len(order), bool))
-
-
-def quaternion_from_rotation(rotation: Array) -> Array:
-    """(n, 3, 3) rotations to (n, 4) unit quaternions wxyz with w >= 0, at every angle.
-
-    Of the four columns of 4 q q^T (Shepperd 1978) the one with the largest diagonal is divided by its root,
-    so nothing is ever divided by less than 1/2.
-    """
-    r = np.asarray(rotation, float)
-    m = [[r[:, i, j] for j in range(3)] for i in range(3)]
-    product = np.empty((len(r), 4, 4))
-    product[:, 0, 0] = 1 + m[0][0] + m[1][1] + m[2][2]
-    product[:, 1, 1] = 1 + m[0][0] - m[1][1] - m[2][2]
-    product[:, 2, 2] = 1 - m[0][0] + m[1][1] - m[2][2]
-    product[:, 3, 3] = 1 - m[0][0] - m[1][1] + m[2][2]
-    product[:, 0, 1] = product[:, 1, 0] = m[2][1] - m[1][2]
-    product[:, 0, 2] = product[:, 2, 0] = m[0][2] - m[2][0]
-    product[:, 0, 3] = product[:, 3, 0] = m[1][0] - m[0][1]
-    product[:, 1, 2] = product[:, 2, 1] = m[0][1] + m[1][0]
-    product[:, 1, 3] = product[:, 3, 1] = m[0][2] + m[2][0]
-    product[:, 2, 3] = product[:, 3, 2] = m[1][2] + m[2][1]
-    largest = np.einsum("nii->ni", product).argmax(1)
-    q = product[np.arange(len(r)), largest]
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(np.where(q[:, :1] < 0, -q, q))
-
-
-def rotation_from_quaternion(wxyz: Array) -> Array:
-    """(n, 4) quaternions wxyz, of any length but 0, to (n, 3, 3) rotations."""
-    w, x, y, z = (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)

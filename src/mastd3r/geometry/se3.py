@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .quaternion import quaternion_from_rotation
+
 Array = NDArray[Any]
 _SMALL = 1e-7
 
@@ -27,7 +29,7 @@ def so3_exp(phi: Array) -> Array:
 
 def so3_log(rotation: Array) -> Array:
     """(3, 3) rotation to its (3,) rotation vector, angle in 0..pi."""
-    wxyz = wxyz_from_rotation(rotation)
+    wxyz = quaternion_from_rotation(rotation)
     sine = float(np.linalg.norm(wxyz[1:]))
     if sine < _SMALL:
         return 2 * wxyz[1:] / wxyz[0]
@@ -92,21 +94,3 @@ def nearest_rotation(matrix: Array) -> Array:
     """Project (3, 3) on to the rotations (orthogonal Procrustes)."""
     u, _, vt = np.linalg.svd(matrix)
     return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-
-
-def wxyz_from_rotation(rotation: Array) -> Array:
-    """(3, 3) to a unit quaternion (w, x, y, z) with w >= 0; picks the largest pivot, so never divides by ~0."""
-    r = rotation
-    trace = r[0, 0] + r[1, 1] + r[2, 2]
-    pivots = np.array([trace, r[0, 0], r[1, 1], r[2, 2]])
-    i = int(pivots.argmax())
-    if i == 0:
-        q = np.array([1 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    elif i == 1:
-        q = np.array([r[2, 1] - r[1, 2], 1 + 2 * r[0, 0] - trace, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]])
-    elif i == 2:
-        q = np.array([r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 + 2 * r[1, 1] - trace, r[1, 2] + r[2, 1]])
-    else:
-        q = np.array([r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 + 2 * r[2, 2] - trace])
-    q = q / np.linalg.norm(q)
-    return q if q[0] >= 0 else -q

@@ -29,11 +29,22 @@ class Sim3:
         """From a (4, 4) rigid transform."""
         return Sim3(a_from_b[:3, :3], a_from_b[:3, 3], scale)
 
+    def in_lengths(self, factor: float) -> Sim3:
+        """The same with a's lengths times ``factor``."""
+        return Sim3(self.rotation, factor * self.translation, factor * self.scale)
+
     @property
     def rigid(self) -> Array:
         """(4, 4) rotation and translation without the scale."""
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = self.rotation, self.translation
+        return out
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) of homogeneous points, the scale in its rotation block."""
+        out = self.rigid
+        out[:3, :3] *= self.scale
         return out
 
     def apply(self, points_b: Array) -> Array:

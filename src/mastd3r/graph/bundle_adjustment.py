@@ -1,7 +1,7 @@
 """Joint optimisation of keyframe poses, inverse depths and intrinsics from flow matches (docs/joint_optimisation.md).
 
-Levenberg-Marquardt; depths are eliminated by the Schur complement, host by host, so the dense system that is solved
-has 6 rows a keyframe and 6 for the lens.
+Levenberg-Marquardt; depths are eliminated by the Schur complement, one anchor keyframe after another, so the dense
+system that is solved has 6 rows a keyframe and 6 for the intrinsics.
 """
 
 from __future__ import annotations
@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..concurrency import on_two_threads
-from ..geometry.least_squares import damped_solve
+from ..geometry.least_squares import Damping, damped_solve, levenberg_marquardt
 from ..geometry.reprojection_kernels import N_COLS, N_GLOBAL, anchor_columns, anchor_cost, anchor_system
 from ..geometry.se3 import adjoint, inverse, se3_exp
 from .factors import Factors, ReprojectionFactor, Variables
 from .intrinsics import Intrinsics
 
 Array = NDArray[Any]
-AT_INFINITY = 1e-6  # of a host's typical inverse depth: that of a point further away than infinity once all is solved
+AT_INFINITY = 1e-6  # of an anchor's typical inverse depth: that of a point beyond infinity once all is solved
 STEP_AT_INFINITY = 0.1  # of the same: as far as one step moves a point there, on either side
+DAMPING = Damping(least=1e-7, most=0.0, tries=6)  # a cost is cheap beside a system: one system serves six tries
 
 
 @dataclass(frozen=True)
@@ -36,149 +37,176 @@ class SolveReport:
     focal_sigma_ratio: float  # 1-sigma of log f under unit pixel noise, inf where f is fixed
 
 
-@dataclass
-class _AnchorTerm:
-    """What one host contributes in one iteration, kept for the back-substitution."""
-
-    columns: Array  # global column of each local column, -1 = fixed
-    cross: Array  # (p, n) E
-    hdd: Array
-    bd: Array
-
-
 def solve(
     variables: Variables,
     edges: Sequence[ReprojectionFactor],
-    lens: Intrinsics,
+    intrinsics: Intrinsics,
     *,
     fixed: frozenset[int],
     iterations: int,
     kernel_px: float = 1.0,
     tolerance: float = 1e-4,
 ) -> SolveReport:
-    """Optimise in place. Poses in ``fixed`` stay; every host's depths and the free intrinsics move.
+    """Optimise in place. Poses in ``fixed`` stay; every anchor keyframe's depths and the free intrinsics move.
 
     Stops when the relative decrease of the robust cost is below ``tolerance``. A singular system or an
     exhausted damping ends the loop with ``converged=False``. Meanwhile inverse depths may fall below 0: noise moves
     points at infinity to both sides, and where they may go to one only, the lens makes up for it, or no step is good.
     """
-    by_anchor: Factors = {}
-    for edge in edges:
-        by_anchor.setdefault(edge.i, []).append(edge)
-    moving = [k for k in variables if k not in fixed]
-    row_of = {k: 6 * n for n, k in enumerate(moving)}
-    damping, cost_first, cost, done, converged = 1e-4, -1.0, -1.0, 0, False
-    sigma = float("inf")
-    for done in range(1, iterations + 1):
-        hess, rhs, anchors, cost = _linearise(variables, by_anchor, lens, row_of, kernel_px)
-        cost_first = cost if cost_first < 0 else cost_first
-        accepted = False
-        for _ in range(6):
-            step = damped_solve(hess, rhs, damping)
-            if step is None:
-                damping *= 10
-                continue
-            saved = _apply(variables, lens, anchors, row_of, step)
-            trial = _cost(variables, by_anchor, lens, kernel_px)
-            if trial <= cost * (1 + 1e-9):
-                accepted = True
-                break
-            _restore(variables, lens, saved)
-            damping *= 10
-        if not accepted:
-            break
-        damping = max(damping * 0.2, 1e-7)
-        sigma = _focal_sigma(hess, lens)
-        if cost - trial < tolerance * max(cost, 1e-12):
-            converged, cost = True, trial
-            break
-        cost = trial
-    if by_anchor and len(fixed) == 1:
-        _face_scene(variables, by_anchor, min(fixed))
-    for i in by_anchor:
-        depth = variables[i].inv_depth
-        variables[i].inv_depth = np.maximum(depth, AT_INFINITY * _typical(depth))
-    return SolveReport(done, converged, cost_first, cost, sigma)
+    problem = _Problem(variables, edges, intrinsics, fixed, kernel_px)
+    poses = {k: v.cam_from_world for k, v in variables.items()}
+    start = _Estimate(problem, poses, {k: v.inv_depth for k, v in variables.items()}, intrinsics.values)
+    found = levenberg_marquardt(start, DAMPING, iterations=iterations, tolerance=tolerance)
+    end, anchors = found.estimate, list(problem.by_anchor)
+    poses, depths = end.poses, end.depths
+    if anchors and len(fixed) == 1:
+        poses, depths = _facing_scene(end, anchors, min(fixed))
+    for k, v in variables.items():
+        v.cam_from_world, v.inv_depth = poses[k], depths[k]
+    for i in anchors:
+        v = variables[i]
+        v.inv_depth = np.maximum(v.inv_depth, AT_INFINITY * _typical(v.inv_depth))
+    for i, term in problem.terms.items():
+        variables[i].depth_info = term.depth_info
+    intrinsics.values = end.g
+    sigma = float("inf") if found.hess is None else _focal_sigma(found.hess, intrinsics)
+    return SolveReport(found.iterations, found.converged, found.cost_first, found.cost_last, sigma)
 
 
-def _face_scene(variables: Variables, by_anchor: Factors, still: int) -> None:
-    """Where most points ended behind their cameras: inverse depths and translations, all negated, project the same."""
-    if np.median(np.concatenate([variables[i].inv_depth for i in by_anchor])) >= 0:
-        return
-    still_from_world = variables[still].cam_from_world
+@dataclass
+class _AnchorTerm:
+    """What one anchor keyframe contributes in one iteration, kept for the back-substitution."""
+
+    columns: Array  # global column of each local column, -1 = fixed
+    cross: Array  # (p, n) E
+    hdd: Array
+    bd: Array
+    depth_info: Array  # (p,) hdd without the prior
+
+
+class _Problem:
+    """What does not change while it is solved; and the parts of the last system, by anchor keyframe."""
+
+    def __init__(
+        self,
+        variables: Variables,
+        edges: Sequence[ReprojectionFactor],
+        intrinsics: Intrinsics,
+        fixed: frozenset[int],
+        kernel_px: float,
+    ) -> None:
+        self.variables, self.intrinsics, self.kernel_px = variables, intrinsics, kernel_px
+        self.by_anchor: Factors = {}
+        for edge in edges:
+            self.by_anchor.setdefault(edge.i, []).append(edge)
+        self.row_of = {k: 6 * n for n, k in enumerate(k for k in variables if k not in fixed)}
+        self.terms: dict[int, _AnchorTerm] = {}
+
+
+@dataclass(frozen=True)
+class _Estimate:
+    """Values of all unknowns."""
+
+    problem: _Problem
+    poses: dict[int, Array]  # cam_from_world (4, 4) of each keyframe
+    depths: dict[int, Array]  # (p,) inverse
+    g: Array  # (6,) intrinsics
+
+    def linearised(self) -> tuple[Array, Array, float]:
+        """The system without the depths; their terms are left with the problem."""
+        problem, intrinsics = self.problem, self.problem.intrinsics
+        size = 6 * len(problem.row_of) + N_GLOBAL
+        hess, rhs = np.zeros((size, size)), np.zeros(size)
+        total = self._prior_cost()
+        parts = on_two_threads(self._anchor_part, list(problem.by_anchor))
+        for i, (term, whole_h, whole_b, cost) in zip(problem.by_anchor, parts, strict=True):
+            total += cost
+            problem.terms[i] = term
+            # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
+            scaled = term.cross / term.hdd[:, None]
+            local_h = whole_h - scaled.T @ term.cross
+            local_b = whole_b - scaled.T @ term.bd
+            keep = term.columns >= 0
+            rows = term.columns[keep]
+            np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
+            np.add.at(rhs, rows, local_b[keep])
+        free = np.flatnonzero(intrinsics.free)
+        rows = size - N_GLOBAL + free
+        hess[rows, rows] += intrinsics.prior_info[free]
+        rhs[rows] += intrinsics.prior_info[free] * (intrinsics.prior[free] - self.g[free])
+        return hess, rhs, total
+
+    def cost(self) -> float:
+        """The robust cost, priors included."""
+        problem = self.problem
+
+        def one(i: int) -> float:
+            matches, px = self._matches(i), problem.variables[i].px
+            return float(anchor_cost(px, self.depths[i], *matches, self.g, problem.kernel_px).sum())
+
+        return self._prior_cost() + sum(on_two_threads(one, list(problem.by_anchor)))
+
+    def moved(self, step: Array) -> _Estimate:
+        """The estimate after a step of poses and intrinsics, with the depths that follow from it."""
+        poses, depths = dict(self.poses), dict(self.depths)
+        for k, row in self.problem.row_of.items():
+            poses[k] = se3_exp(step[row : row + 6]) @ self.poses[k]
+        for i, term in self.problem.terms.items():
+            local = np.where(term.columns >= 0, step[term.columns], 0.0)
+            delta = (term.bd - term.cross @ local) / term.hdd
+            depth = self.depths[i]
+            least = STEP_AT_INFINITY * _typical(depth)
+            depths[i] = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
+        return _Estimate(self.problem, poses, depths, self.g + step[-N_GLOBAL:])
+
+    def _matches(self, i: int) -> tuple[Array, Array, Array]:
+        """Targets (m, p, 2), weights (m, p) and j_from_i (m, 4, 4) of an anchor keyframe's edges."""
+        edges, world_from_anchor = self.problem.by_anchor[i], inverse(self.poses[i])
+        j_from_i = np.stack([self.poses[e.j] @ world_from_anchor for e in edges])
+        return np.stack([e.target for e in edges]), np.stack([e.weight for e in edges]), j_from_i
+
+    def _anchor_part(self, i: int) -> tuple[_AnchorTerm, Array, Array, float]:
+        """What an anchor keyframe's depths are eliminated with, its part of the system before that, its cost."""
+        problem, v, depth = self.problem, self.problem.variables[i], self.depths[i]
+        target, weight, j_from_i = self._matches(i)
+        h, b, e, hdd, bd, cost = anchor_system(v.px, depth, target, weight, j_from_i, self.g, problem.kernel_px)
+        depth_info = hdd.sum(0)
+        hdd_i = depth_info + v.prior_info + 1e-9
+        bd_i = bd.sum(0) + v.prior_info * (v.prior_depth - depth)
+        local_h, local_b, cross = _anchor_local(h, b, e, j_from_i)
+        first = 6 * len(problem.row_of)
+        last_columns = np.where(problem.intrinsics.free, np.arange(first, first + N_GLOBAL), -1)
+        ends = [i, *(edge.j for edge in problem.by_anchor[i])]
+        columns = np.concatenate([*(_pose_columns(k, problem.row_of) for k in ends), last_columns])
+        return _AnchorTerm(columns, cross, hdd_i, bd_i, depth_info), local_h, local_b, float(cost.sum())
+
+    def _prior_cost(self) -> float:
+        variables, intrinsics = self.problem.variables, self.problem.intrinsics
+        free = intrinsics.free
+        total = float((intrinsics.prior_info[free] * (self.g - intrinsics.prior)[free] ** 2).sum())
+        for i in self.problem.by_anchor:
+            v = variables[i]
+            total += float((v.prior_info * (self.depths[i] - v.prior_depth) ** 2).sum())
+        return total
+
+
+def _facing_scene(end: _Estimate, anchors: list[int], still: int) -> tuple[dict[int, Array], dict[int, Array]]:
+    """Poses and depths; where most points ended behind their cameras, inverse depths and translations are negated,
+    all of them: they project the same."""
+    if np.median(np.concatenate([end.depths[i] for i in anchors])) >= 0:
+        return end.poses, end.depths
+    still_from_world = end.poses[still]
     world_from_still = inverse(still_from_world)
-    for block in variables.values():
-        pose = block.cam_from_world @ world_from_still
+    poses = {}
+    for k, cam_from_world in end.poses.items():
+        pose = cam_from_world @ world_from_still
         pose[:3, 3] *= -1
-        block.cam_from_world = pose @ still_from_world
-    for i in by_anchor:
-        variables[i].inv_depth = -variables[i].inv_depth
+        poses[k] = pose @ still_from_world
+    return poses, {**end.depths, **{i: -end.depths[i] for i in anchors}}
 
 
 def _typical(inv_depth: Array) -> float:
     return float(np.abs(inv_depth).mean())
-
-
-def _gather(variables: Variables, edges: list[ReprojectionFactor]) -> tuple[Array, Array, Array]:
-    anchor_from_world = variables[edges[0].i].cam_from_world
-    world_from_anchor = inverse(anchor_from_world)
-    j_from_i = np.stack([variables[e.j].cam_from_world @ world_from_anchor for e in edges])
-    return np.stack([e.target for e in edges]), np.stack([e.weight for e in edges]), j_from_i
-
-
-def _linearise(
-    variables: Variables,
-    by_anchor: Factors,
-    lens: Intrinsics,
-    row_of: dict[int, int],
-    kernel_px: float,
-) -> tuple[Array, Array, dict[int, _AnchorTerm], float]:
-    size = 6 * len(row_of) + N_GLOBAL
-    hess, rhs = np.zeros((size, size)), np.zeros(size)
-    anchors: dict[int, _AnchorTerm] = {}
-    total = _prior_cost(variables, by_anchor, lens)
-    lens_cols = np.where(lens.free, np.arange(size - N_GLOBAL, size), -1)
-
-    def one(i: int) -> tuple[_AnchorTerm, Array, Array, float]:
-        return _anchor_part(variables, by_anchor[i], lens, row_of, lens_cols, kernel_px)
-
-    for i, (anchor, whole_h, whole_b, cost) in zip(by_anchor, on_two_threads(one, list(by_anchor)), strict=True):
-        total += cost
-        anchors[i] = anchor
-        # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
-        scaled = anchor.cross / anchor.hdd[:, None]
-        local_h = whole_h - scaled.T @ anchor.cross
-        local_b = whole_b - scaled.T @ anchor.bd
-        keep = anchor.columns >= 0
-        rows = anchor.columns[keep]
-        np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
-        np.add.at(rhs, rows, local_b[keep])
-    free = np.flatnonzero(lens.free)
-    rows = size - N_GLOBAL + free
-    hess[rows, rows] += lens.prior_info[free]
-    rhs[rows] += lens.prior_info[free] * (lens.prior[free] - lens.values[free])
-    return hess, rhs, anchors, total
-
-
-def _anchor_part(
-    variables: Variables,
-    edges: list[ReprojectionFactor],
-    lens: Intrinsics,
-    row_of: dict[int, int],
-    lens_cols: Array,
-    kernel_px: float,
-) -> tuple[_AnchorTerm, Array, Array, float]:
-    """One host: what its depths are eliminated with, its part of the system before that, its cost."""
-    i = edges[0].i
-    block = variables[i]
-    target, weight, j_from_i = _gather(variables, edges)
-    h, b, e, hdd, bd, cost = anchor_system(block.px, block.inv_depth, target, weight, j_from_i, lens.values, kernel_px)
-    block.depth_info = hdd.sum(0)
-    hdd_i = block.depth_info + block.prior_info + 1e-9
-    bd_i = bd.sum(0) + block.prior_info * (block.prior_depth - block.inv_depth)
-    local_h, local_b, cross = _anchor_local(h, b, e, j_from_i)
-    columns = np.concatenate([_pose_columns(i, row_of)] + [_pose_columns(x.j, row_of) for x in edges] + [lens_cols])
-    return _AnchorTerm(columns, cross, hdd_i, bd_i), local_h, local_b, float(cost.sum())
 
 
 def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
@@ -187,7 +215,7 @@ def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
 
 
 def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
-    """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, lens]: J_i = -J_j Ad(j_from_i)."""
+    """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, intrinsics]: J_i = -J_j Ad(j_from_i)."""
     m, n = len(h), 6 + 6 * len(h) + N_GLOBAL
     hess, rhs, to_local = np.zeros((n, n)), np.zeros(n), np.zeros((m, N_COLS, 6 + N_COLS))
     to_local[:, :, 6:] = np.eye(N_COLS)
@@ -200,59 +228,10 @@ def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array,
     return hess, rhs, anchor_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 
-def _focal_sigma(hess: Array, lens: Intrinsics) -> float:
-    if not lens.free[0]:
+def _focal_sigma(hess: Array, intrinsics: Intrinsics) -> float:
+    if not intrinsics.free[0]:
         return float("inf")
     unit = np.zeros(len(hess))
     unit[-N_GLOBAL] = 1.0
     column = damped_solve(hess, unit, 1e-9)
     return float("inf") if column is None or column[-N_GLOBAL] <= 0 else float(np.sqrt(column[-N_GLOBAL]))
-
-
-def _apply(
-    variables: Variables,
-    lens: Intrinsics,
-    anchors: dict[int, _AnchorTerm],
-    row_of: dict[int, int],
-    step: Array,
-) -> tuple[Array, dict[int, tuple[Array, Array]]]:
-    saved = (lens.values.copy(), {k: (b.cam_from_world, b.inv_depth) for k, b in variables.items()})
-    for k, row in row_of.items():
-        variables[k].cam_from_world = se3_exp(step[row : row + 6]) @ variables[k].cam_from_world
-    lens.values = lens.values + step[-N_GLOBAL:]
-    for i, anchor in anchors.items():
-        local = np.where(anchor.columns >= 0, step[anchor.columns], 0.0)
-        delta = (anchor.bd - anchor.cross @ local) / anchor.hdd
-        depth = variables[i].inv_depth
-        least = STEP_AT_INFINITY * _typical(depth)
-        variables[i].inv_depth = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
-    return saved
-
-
-def _restore(variables: Variables, lens: Intrinsics, saved: tuple[Array, dict[int, tuple[Array, Array]]]) -> None:
-    lens.values = saved[0]
-    for k, (pose, depth) in saved[1].items():
-        variables[k].cam_from_world, variables[k].inv_depth = pose, depth
-
-
-def _prior_cost(variables: Variables, by_anchor: Factors, lens: Intrinsics) -> float:
-    free = lens.free
-    total = float((lens.prior_info[free] * (lens.values - lens.prior)[free] ** 2).sum())
-    for i in by_anchor:
-        b = variables[i]
-        total += float((b.prior_info * (b.inv_depth - b.prior_depth) ** 2).sum())
-    return total
-
-
-def _cost(
-    variables: Variables,
-    by_anchor: Factors,
-    lens: Intrinsics,
-    kernel_px: float,
-) -> float:
-    def one(i: int) -> float:
-        target, weight, j_from_i = _gather(variables, by_anchor[i])
-        block = variables[i]
-        return float(anchor_cost(block.px, block.inv_depth, target, weight, j_from_i, lens.values, kernel_px).sum())
-
-    return _prior_cost(variables, by_anchor, lens) + sum(on_two_threads(one, list(by_anchor)))

@@ -1,4 +1,4 @@
-"""The unknowns of a keyframe, and the matches that tie two of them."""
+"""The unknowns of a keyframe, and the matches that hold two keyframes together."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Array = NDArray[Any]
 
 @dataclass
 class ReprojectionFactor:
-    """Matches of host i's grid pixels in keyframe j."""
+    """An edge: matches of anchor keyframe i's grid pixels in keyframe j."""
 
     i: int
     j: int
@@ -23,7 +23,7 @@ class ReprojectionFactor:
 
 @dataclass
 class KeyframeVariables:
-    """One keyframe in the problem."""
+    """One keyframe's unknowns in the problem, and their priors."""
 
     px: Array  # (p, 2)
     inv_depth: Array  # (p,)

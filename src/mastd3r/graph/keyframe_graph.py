@@ -1,10 +1,13 @@
-"""The one owner of poses: keyframes, their depths, the lens, the matches between them, and every frame's place."""
+"""The one owner of poses: keyframes, their depths, the intrinsics, the matches between them, every frame's place.
+
+Nothing else writes them (tests/test_graph_writers.py): others ask the graph, by what it is that they want.
+"""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +15,13 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..config import GraphConfig
-from ..geometry.reprojection_kernels import N_GLOBAL
 from ..geometry.se3 import inverse
+from ..geometry.sim3 import Sim3
 from ..types import Matches, State, WorkFrame
 from .bundle_adjustment import SolveReport, solve
 from .factors import KeyframeVariables, ReprojectionFactor
-from .intrinsics import LATE, RADIAL, Intrinsics, camera_of
+from .intrinsics import Intrinsics, camera_of
+from .windows import Window, depths_of, everything, sliding
 
 Array = NDArray[Any]
 FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
@@ -52,8 +56,8 @@ class FrameRecord:
 class KeyframeGraph:
     """Keyframes and what holds them together. Lengths are map units, pixels are at working size."""
 
-    def __init__(self, config: GraphConfig, lens: Intrinsics) -> None:
-        self.config, self.intrinsics = config, lens
+    def __init__(self, config: GraphConfig, intrinsics: Intrinsics) -> None:
+        self.config, self.intrinsics = config, intrinsics
         self.size = (0, 0)
         self.keyframes: list[Keyframe] = []
         self.variables: dict[int, KeyframeVariables] = {}
@@ -86,7 +90,7 @@ class KeyframeGraph:
         return sorted({s: k for k, s in sorted(self.submap_of.items(), reverse=True)}.values())
 
     def camera(self) -> Camera:
-        """The lens at working size."""
+        """The camera at working size."""
         return camera_of(self.intrinsics, self.size)
 
     def world_from_cam(self, kf_id: int) -> Array:
@@ -95,16 +99,29 @@ class KeyframeGraph:
 
     def depth_info(self, kf_id: int) -> Array:
         """(p,) information of a keyframe's inverse depths, prior included."""
-        block = self.variables[kf_id]
-        return block.prior_info if len(block.depth_info) == 0 else block.depth_info + block.prior_info
+        v = self.variables[kf_id]
+        return v.prior_info if len(v.depth_info) == 0 else v.depth_info + v.prior_info
 
     def median_inv_depth(self, kf_id: int) -> float:
         """Median over the points that have been seen from elsewhere."""
-        block = self.variables[kf_id]
-        seen = block.depth_info > 0 if len(block.depth_info) else np.zeros(len(block.inv_depth), bool)
-        return float(np.median(block.inv_depth[seen] if seen.sum() > 10 else block.inv_depth))
+        v = self.variables[kf_id]
+        seen = v.depth_info > 0 if len(v.depth_info) else np.zeros(len(v.inv_depth), bool)
+        return float(np.median(v.inv_depth[seen] if seen.sum() > 10 else v.inv_depth))
 
-    # -- writing ---------------------------------------------------------------------------------------------
+    def connected(self, i: int, j: int) -> bool:
+        """True where matches of one in the other are edges."""
+        return any({e.i, e.j} == {i, j} for e in self.edges)
+
+    def connected_pairs(self) -> set[frozenset[int]]:
+        """All pairs that are ``connected``, for those who ask about many."""
+        return {frozenset((e.i, e.j)) for e in self.edges}
+
+    def edges_among(self, ids: Iterable[int]) -> list[ReprojectionFactor]:
+        """Edges with both ends in ``ids``."""
+        inside = set(ids)
+        return [e for e in self.edges if e.i in inside and e.j in inside]
+
+    # -- growing and shrinking -------------------------------------------------------------------------------
 
     def believe_focal(self, focal_px: float | None) -> None:
         """Start the lens at a focal length that a frame's own points speak of, where a camera may have it."""
@@ -186,22 +203,6 @@ class KeyframeGraph:
             last.index, last.timestamp_s, kf.id, np.eye(4), last.state, *_nothing(), is_keyframe=True
         )
 
-    def doubt(self, kf_id: int, static: Array) -> None:
-        """Future evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
-
-        The frames that hang on the keyframe keep matches of these points, which count for less as well.
-        """
-        kf = self.keyframes[kf_id]
-        np.minimum(kf.static, static, out=kf.static)
-        half = round(np.sqrt(kf.moving.size / len(kf.work.px)) / 2)
-        for n in np.flatnonzero(static < 0.5):
-            x, y = np.rint(kf.work.px[n]).astype(int)
-            cell = kf.moving[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
-            np.maximum(cell, np.uint8(255 * (1 - static[n])), out=cell)
-        for r in self.records:
-            if r.kf_id == kf_id:
-                r.weight = (r.weight * static[r.points]).astype(np.float32)
-
     def start_submap(self) -> None:
         """What comes next is not connected to what is there, until it is recognised."""
         self.submap = 1 + max(self.submap_of.values(), default=-1)
@@ -221,7 +222,7 @@ class KeyframeGraph:
         self.started.discard(self.submap)
 
     def part(self) -> KeyframeGraph:
-        """The submap being tracked as a graph by itself, sharing keyframes, blocks, edges and records."""
+        """The submap being tracked as a graph by itself, sharing keyframes, variables, edges and records."""
         ids = set(self.members())
         out = KeyframeGraph(self.config, self.intrinsics)
         out.size, out.submap = self.size, self.submap
@@ -236,46 +237,131 @@ class KeyframeGraph:
         """A copy to which edges may be added, and whose window may be solved, while this one is read."""
         out = copy.copy(self)
         out.keyframes, out.edges, out.records = list(self.keyframes), list(self.edges), []
-        out.variables = {k: copy.copy(b) for k, b in self.variables.items()}
-        out.intrinsics = copy.copy(self.intrinsics)
+        out.variables = {k: copy.copy(v) for k, v in self.variables.items()}
         return out
 
     def take(self, aside: KeyframeGraph) -> None:
-        """Edges, poses, depths and lens of a copy; nothing may have been added here since."""
+        """Edges, poses, depths and intrinsics of a copy; nothing may have been added here since."""
         if len(aside.keyframes) != len(self.keyframes):
             raise ValueError(f"take: expected a copy of {len(self.keyframes)} keyframes, got {len(aside.keyframes)}")
         self.edges, self.variables, self.intrinsics = aside.edges, aside.variables, aside.intrinsics
 
+    # -- poses, depths, intrinsics, weights ------------------------------------------------------------------
+
+    def set_intrinsics(self, intrinsics: Intrinsics) -> None:
+        """Other intrinsics, or other priors of them."""
+        self.intrinsics = intrinsics
+
+    def set_keyframe_pose(self, kf_id: int, cam_from_world: Array) -> None:
+        """Place a keyframe, (4, 4); the frames that hang on it come with it."""
+        self.variables[kf_id].cam_from_world = cam_from_world
+
+    def set_depths(self, kf_id: int, inv_depth: Array) -> None:
+        """Inverse depths (p,) of a keyframe's points; the prior, and what matches said of them, stay."""
+        self.variables[kf_id].inv_depth = inv_depth
+
+    def hold_depths(self, kf_id: int, info: Array) -> None:
+        """A keyframe's present depths become their own prior, with information ``info`` (p,)."""
+        v = self.variables[kf_id]
+        v.prior_depth, v.prior_info = v.inv_depth.copy(), info
+
+    def forget_matched_depths(self, kf_id: int) -> None:
+        """What matches said of a keyframe's depths counts no more."""
+        self.variables[kf_id].depth_info = np.zeros(0)
+
+    def set_record_pose(self, record: FrameRecord, cam_from_kf: Array) -> None:
+        """Place a frame, (4, 4) relative to its keyframe."""
+        record.cam_from_kf = cam_from_kf
+
+    def set_record_state(self, record: FrameRecord, state: State) -> None:
+        """How a frame came by its pose."""
+        record.state = state
+
+    def set_weights(self, matches: ReprojectionFactor | FrameRecord, weight: Array) -> None:
+        """What the matches of an edge, or of a frame, count: (p,), or (m,) of those that were kept."""
+        matches.weight = weight
+
+    def transform_keyframes(self, ids: Iterable[int], new_from_old: Sim3) -> None:
+        """Bring some keyframes, and the frames that hang on them, into another world."""
+        chosen, old_from_new = set(ids), inverse(new_from_old.rigid)
+        self.scale_keyframes(chosen, new_from_old.scale)
+        for k in chosen:
+            self.set_keyframe_pose(k, self.variables[k].cam_from_world @ old_from_new)
+
+    def scale_keyframes(self, ids: Iterable[int], factor: float) -> None:
+        """Lengths of some keyframes, and of the frames that hang on them, times ``factor``: about the origin."""
+        chosen = set(ids)
+        for k in chosen:
+            v = self.variables[k]
+            v.cam_from_world = v.cam_from_world.copy()
+            v.cam_from_world[:3, 3] *= factor
+            v.inv_depth, v.prior_depth = v.inv_depth / factor, v.prior_depth / factor
+            v.prior_info, v.depth_info = v.prior_info * factor**2, v.depth_info * factor**2
+        for r in self.records:
+            if r.kf_id in chosen:
+                r.cam_from_kf = r.cam_from_kf.copy()
+                r.cam_from_kf[:3, 3] *= factor
+
+    def normalise(self) -> None:
+        """Monocular scale is free: keep the median inverse depth of the first three keyframes at one.
+
+        Where depths are measured (strong priors) the scale is theirs and nothing is done.
+        """
+        first = [self.variables[k] for k in sorted(self.variables)[:3]]
+        if any((v.prior_info * v.inv_depth**2 > 25).mean() > 0.1 for v in first):
+            return
+        m = float(np.median([self.median_inv_depth(k) for k in sorted(self.variables)[:3]]))
+        if not np.isfinite(m) or m <= 0:
+            return
+        self.scale_keyframes(self.variables, m)
+
+    def discount_points(self, kf_id: int, static: Array) -> None:
+        """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
+
+        The frames that hang on the keyframe keep matches of these points, which count for less as well.
+        """
+        kf = self.keyframes[kf_id]
+        np.minimum(kf.static, static, out=kf.static)
+        half = round(np.sqrt(kf.moving.size / len(kf.work.px)) / 2)
+        for n in np.flatnonzero(static < 0.5):
+            x, y = np.rint(kf.work.px[n]).astype(int)
+            cell = kf.moving[max(y - half, 0) : y + half, max(x - half, 0) : x + half]
+            np.maximum(cell, np.uint8(255 * (1 - static[n])), out=cell)
+        for r in self.records:
+            if r.kf_id == kf_id:
+                r.weight = (r.weight * static[r.points]).astype(np.float32)
+
     # -- optimisation ----------------------------------------------------------------------------------------
+
+    def optimise(
+        self, problem: Window, iterations: int, kernel_px: float = 1.0, tolerance: float = 1e-4
+    ) -> SolveReport:
+        """Joint optimisation of a part of the graph; see ``bundle_adjustment.solve``."""
+        intrinsics = replace(self.intrinsics, prior_info=problem.prior_info(self.intrinsics))
+        variables = {k: self.variables[k] for k in problem.ids}
+        report = solve(
+            variables,
+            problem.edges,
+            intrinsics,
+            fixed=problem.fixed,
+            iterations=iterations,
+            kernel_px=kernel_px,
+            tolerance=tolerance,
+        )
+        self.intrinsics = replace(self.intrinsics, values=intrinsics.values)
+        return report
 
     def solve_window(self) -> SolveReport:
         """The last ``window`` keyframes move, everything they are matched with holds them."""
-        ids, size = self.members(), self.config.window
-        n, active = len(ids), set(ids[-size:])
-        edges = [e for e in self.edges if e.i in active]
-        near = active | {e.j for e in edges}
-        whole = len(near) == n and n <= size
-        fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
-        moves = n <= 2 * size or n % 4 == 0
-        early = RADIAL if len(self.keyframes) < self.config.radial_keyframes else ()
-        lens = self._lens_with(early if moves else range(N_GLOBAL))
-        report = solve(
-            {k: self.variables[k] for k in sorted(near)},
-            edges,
-            lens,
-            fixed=fixed,
-            iterations=self.config.window_iterations * (2 if whole else 1),
-        )
-        self.intrinsics.values = lens.values
+        window, whole = sliding(self)
+        report = self.optimise(window, self.config.window_iterations * (2 if whole else 1))
         if whole and self.submap == 0:
             self.normalise()
         return report
 
     def solve_depths(self, kf_id: int, iterations: int = 3) -> None:
-        """The depths of one keyframe from the edges that it has; poses and lens stay."""
-        edges = [e for e in self.edges if e.i == kf_id]
-        near = {k: self.variables[k] for k in sorted({kf_id, *(e.j for e in edges)})}
-        solve(near, edges, self._lens_with(range(N_GLOBAL)), fixed=frozenset(near), iterations=iterations)
+        """The depths of one keyframe from the edges that it has; poses and intrinsics stay."""
+        self.optimise(depths_of(self, kf_id), iterations)
 
     @property
     def window_is_all(self) -> bool:
@@ -284,68 +370,10 @@ class KeyframeGraph:
 
     def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
         """Every keyframe moves but the first of each submap."""
-        lens = self._lens_with(())
-        report = solve(
-            self.variables,
-            self.edges,
-            lens,
-            fixed=frozenset(self.roots()),
-            iterations=iterations,
-            kernel_px=kernel_px,
-            tolerance=1e-5,
-        )
-        self.intrinsics.values = lens.values
+        report = self.optimise(everything(self), iterations, kernel_px, tolerance=1e-5)
         self.normalise()
         self.last_report = report
         return report
-
-    def _lens_with(self, fixed: Iterable[int]) -> Intrinsics:
-        """The lens with some unknowns fixed: those named, and those that too few views cannot tell apart."""
-        hold = set(fixed)
-        if len(self.keyframes) < self.config.lens_keyframes:
-            hold |= set(LATE)
-        info = np.where(np.isin(np.arange(N_GLOBAL), list(hold)), np.inf, self.intrinsics.prior_info)
-        return Intrinsics(self.intrinsics.values, self.intrinsics.prior, info)
-
-    def normalise(self) -> None:
-        """Monocular scale is free: keep the median inverse depth of the first three keyframes at one.
-
-        Where depths are measured (strong priors) the scale is theirs and nothing is done.
-        """
-        first = [self.variables[k] for k in sorted(self.variables)[:3]]
-        if any((b.prior_info * b.inv_depth**2 > 25).mean() > 0.1 for b in first):
-            return
-        m = float(np.median([self.median_inv_depth(k) for k in sorted(self.variables)[:3]]))
-        if not np.isfinite(m) or m <= 0:
-            return
-        self.rescale(self.variables, m)
-
-    def rescale(self, ids: Iterable[int], factor: float) -> None:
-        """Lengths of some keyframes, and of the frames that hang on them, times ``factor``: about the origin."""
-        chosen = set(ids)
-        for k in chosen:
-            b = self.variables[k]
-            b.cam_from_world = b.cam_from_world.copy()
-            b.cam_from_world[:3, 3] *= factor
-            b.inv_depth, b.prior_depth = b.inv_depth / factor, b.prior_depth / factor
-            b.prior_info, b.depth_info = b.prior_info * factor**2, b.depth_info * factor**2
-        for r in self.records:
-            if r.kf_id in chosen:
-                r.cam_from_kf = r.cam_from_kf.copy()
-                r.cam_from_kf[:3, 3] *= factor
-
-    def connected(self, i: int, j: int) -> bool:
-        """True where matches of one in the other are edges."""
-        return any({e.i, e.j} == {i, j} for e in self.edges)
-
-    def connected_pairs(self) -> set[frozenset[int]]:
-        """All pairs that are ``connected``, for those who ask about many."""
-        return {frozenset((e.i, e.j)) for e in self.edges}
-
-    def edges_among(self, ids: Iterable[int]) -> list[ReprojectionFactor]:
-        """Edges with both ends in ``ids``."""
-        inside = set(ids)
-        return [e for e in self.edges if e.i in inside and e.j in inside]
 
 
 def _nothing() -> tuple[Array, Array, Array]:

@@ -1,4 +1,4 @@
-"""Drift spread over a chain of keyframes once a place is seen again: first of the scale, then of the poses."""
+"""Sim(3) pose-graph optimisation once a place is seen again: first the scales, then the poses."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
 from ..geometry.se3 import adjoint, inverse, se3_exp, se3_log
+from ..geometry.sim3 import Sim3
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
@@ -25,49 +26,53 @@ class Loop:
 
     i: int
     j: int
-    j_from_i: Array  # (4, 4) in i's lengths
-    scale: float  # i's lengths per length of j
+    j_from_i: Sim3  # from points of camera i to those of camera j, each in the lengths around it
     matches: float  # weighted matches
 
 
 @dataclass(frozen=True)
-class _Link:
-    i: int
+class _Edge:
+    i: int  # rows of the keyframes
     j: int
-    j_from_i: Array
-    log_scale: float
+    j_from_i: Array  # (4, 4)
+    log_scale: float  # lengths around i per length around j
     weight: float
     is_loop: bool = False
 
 
 def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
-    """Move and stretch the keyframes of the submap being tracked so that the loops close. The first one stays.
+    """Sim(3) pose-graph optimisation of the submap being tracked, so that the loops close. Its first keyframe stays.
 
-    CovisibilityEdges are the edges with their present relative poses, and the loops. A link counts by the square of its
-    matches, since one that had few was also at the limit of what can be followed: drift goes there. Scale first,
-    which is linear: minimise the sum of w (x_j - x_i - log s)², x the log of a keyframe's factor. Then the poses,
-    with the links' translations stretched: Gauss-Newton on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
+    The edges are the pairs that matches connect, with their present relative poses, and the loops. An edge counts by
+    the square of its matches, since one that had few was also at the limit of what can be followed: drift goes there.
+    Scale first, which is linear: minimise the sum of w (x_j - x_i - log s)², x the log of a keyframe's factor. Then the
+    poses, with the edges' translations stretched: Gauss-Newton on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
     """
     ids = graph.members()
     row = {k: n for n, k in enumerate(ids)}
-    links = _odometry(graph, row)
-    links += [_Link(row[x.i], row[x.j], x.j_from_i, np.log(x.scale), x.matches**2, True) for x in loops]
-    factor = np.exp(_log_factors(len(ids), links))
+    edges = _present_edges(graph, row) + [_loop_edge(x, row) for x in loops]
+    factor = np.exp(_log_factors(len(ids), edges))
     for k, n in row.items():
-        graph.rescale([k], float(factor[n]))
-    for n, link in enumerate(links):
-        pose = link.j_from_i.copy()
+        graph.scale_keyframes([k], float(factor[n]))
+    for n, edge in enumerate(edges):
+        pose = edge.j_from_i.copy()
         # a loop was measured in i's lengths, an edge belongs to both of its ends
-        pose[:3, 3] *= factor[link.i] if link.is_loop else np.sqrt(factor[link.i] * factor[link.j])
-        links[n] = replace(link, j_from_i=pose)
+        pose[:3, 3] *= factor[edge.i] if edge.is_loop else np.sqrt(factor[edge.i] * factor[edge.j])
+        edges[n] = replace(edge, j_from_i=pose)
     depth = 1 / np.median([graph.median_inv_depth(k) for k in ids])
-    poses = _solve_poses(_chained(graph.variables[ids[0]].cam_from_world, len(ids), links), links, float(depth))
+    poses = _solve_poses(_chained(graph.variables[ids[0]].cam_from_world, len(ids), edges), edges, float(depth))
     for k, n in row.items():
-        graph.variables[k].cam_from_world = poses[n]
+        graph.set_keyframe_pose(k, poses[n])
 
 
-def _odometry(graph: KeyframeGraph, row: dict[int, int]) -> list[_Link]:
-    """One link for each connected pair, with the pose that the graph has now; neighbours are always held a little."""
+def _loop_edge(loop: Loop, row: dict[int, int]) -> _Edge:
+    scale = 1 / loop.j_from_i.scale
+    rigid = loop.j_from_i.in_lengths(scale).rigid
+    return _Edge(row[loop.i], row[loop.j], rigid, float(np.log(scale)), loop.matches**2, True)
+
+
+def _present_edges(graph: KeyframeGraph, row: dict[int, int]) -> list[_Edge]:
+    """One for each connected pair, with the pose that the graph has now; neighbours are always held a little."""
     ids = sorted(row)
     seen = dict.fromkeys(pairwise(ids), 1.0)
     for e in graph.edges:
@@ -75,41 +80,41 @@ def _odometry(graph: KeyframeGraph, row: dict[int, int]) -> list[_Link]:
             pair = (min(e.i, e.j), max(e.i, e.j))
             seen[pair] = max(seen.get(pair, 0.0), float(e.weight.sum()))
     poses = {k: graph.variables[k].cam_from_world for k in row}
-    return [_Link(row[i], row[j], poses[j] @ inverse(poses[i]), 0.0, w**2) for (i, j), w in seen.items()]
+    return [_Edge(row[i], row[j], poses[j] @ inverse(poses[i]), 0.0, w**2) for (i, j), w in seen.items()]
 
 
-def _log_factors(n: int, links: list[_Link]) -> Array:
+def _log_factors(n: int, edges: list[_Edge]) -> Array:
     """(n,) log of every keyframe's factor; the first one's is 0."""
-    i, j = np.array([x.i for x in links]), np.array([x.j for x in links])
-    weight = np.array([x.weight for x in links]) / np.mean([x.weight for x in links])
-    wanted = weight * np.array([x.log_scale for x in links])
-    rows, ones = np.arange(len(links)), np.ones(len(links))
-    jac = csr_array(coo_array((np.r_[ones, -ones], (np.r_[rows, rows], np.r_[j, i])), shape=(len(links), n)))
+    i, j = np.array([x.i for x in edges]), np.array([x.j for x in edges])
+    weight = np.array([x.weight for x in edges]) / np.mean([x.weight for x in edges])
+    wanted = weight * np.array([x.log_scale for x in edges])
+    rows, ones = np.arange(len(edges)), np.ones(len(edges))
+    jac = csr_array(coo_array((np.r_[ones, -ones], (np.r_[rows, rows], np.r_[j, i])), shape=(len(edges), n)))
     hess = (jac.T @ diags_array(weight) @ jac)[1:, 1:] + 1e-9 * diags_array(np.ones(n - 1))
     return np.r_[0.0, np.atleast_1d(spsolve(hess.tocsc(), (jac.T @ wanted)[1:]))]
 
 
-def _chained(first: Array, n: int, links: list[_Link]) -> list[Array]:
+def _chained(first: Array, n: int, edges: list[_Edge]) -> list[Array]:
     """Poses along the strongest edges, loops left out."""
-    steps = {(x.i, x.j): x for x in links if not x.is_loop}
+    steps = {(x.i, x.j): x for x in edges if not x.is_loop}
     cost = coo_array(([1 / max(x.weight, 1e-9) for x in steps.values()], tuple(np.array([*steps]).T)), shape=(n, n))
     order, before = breadth_first_order(minimum_spanning_tree(csr_array(cost)), 0, directed=False)
     poses = [first] * n
     for k in order[1:]:
         b = int(before[k])
-        link = steps.get((b, int(k)))
-        poses[k] = (link.j_from_i if link is not None else inverse(steps[int(k), b].j_from_i)) @ poses[b]
+        edge = steps.get((b, int(k)))
+        poses[k] = (edge.j_from_i if edge is not None else inverse(steps[int(k), b].j_from_i)) @ poses[b]
     return poses
 
 
-def _solve_poses(poses: list[Array], links: list[_Link], depth: float) -> list[Array]:
-    """Gauss-Newton on the links; a translation of the scene's depth counts like a turn of one radian."""
+def _solve_poses(poses: list[Array], edges: list[_Edge], depth: float) -> list[Array]:
+    """Gauss-Newton on the edges; a translation of the scene's depth counts like a turn of one radian."""
     n = len(poses)
     unit = np.r_[np.full(3, 1 / depth), np.ones(3)] ** 2
-    mean = np.mean([x.weight for x in links])
+    mean = np.mean([x.weight for x in edges])
     for _ in range(ITERATIONS):
         rows, cols, values, rhs = [], [], [], np.zeros(6 * n)
-        for x in links:
+        for x in edges:
             found = poses[x.j] @ inverse(poses[x.i])
             residual, jac_i = se3_log(found @ inverse(x.j_from_i)), -adjoint(found)
             w = unit * x.weight / mean

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.se3 import inverse, se3_exp, se3_log
+from ..geometry.sim3 import Sim3
 from ..types import Matches
 from .depth import depth_confidence
 from .keyframe_graph import KeyframeGraph
@@ -19,43 +20,38 @@ MOST_AHEAD = 3.0  # for how many times that span it is believed
 MIN_COMMON = 20  # matches whose depth is known on both sides, for a scale
 
 
-def scale_between(
-    graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: Matches, weight: Array
-) -> float | None:
-    """Lengths of i's submap per length of j's: median ratio of matched depths; None where too few are known.
+def with_scale(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: Matches, weight: Array) -> Sim3 | None:
+    """A pose between two submaps as a similarity: the median ratio of matched depths; None where too few are known.
 
-    ``j_from_i`` (4, 4) in i's lengths; ``matches`` of i's pixels in j, ``weight`` (p,).
+    ``j_from_i`` (4, 4) in i's lengths; ``matches`` of i's pixels in j, ``weight`` (p,). What is returned takes points
+    of camera i, in the lengths of its submap, to those of camera j in the lengths of the other.
     """
     a, b, grid = graph.variables[i], graph.variables[j], graph.keyframes[j].work.grid
     known_a = depth_confidence(a.inv_depth, graph.depth_info(i)) > 0.5
-    rays = graph.camera().rays(a.px)
-    depth = (rays / np.maximum(a.inv_depth, 1e-9)[:, None]) @ j_from_i[2, :3] + j_from_i[2, 3]
+    points = graph.camera().rays(a.px) / np.maximum(a.inv_depth, 1e-9)[:, None]
+    depth = points @ j_from_i[2, :3] + j_from_i[2, 3]
     cell_px = min(graph.size[0] // grid[1], graph.size[1] // grid[0])
     at = matches.new_px / cell_px - 0.5 + 0.5 / cell_px
     xy = at.astype(np.float32)[:, None]
     inv_b = cv2.remap(b.inv_depth.reshape(grid).astype(np.float32), xy, None, cv2.INTER_NEAREST)[:, 0]
-    trusted = depth_confidence(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
-    known_b = cv2.remap(trusted, xy, None, cv2.INTER_NEAREST)[:, 0] > 0.5
+    confidence_b = depth_confidence(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
+    known_b = cv2.remap(confidence_b, xy, None, cv2.INTER_NEAREST)[:, 0] > 0.5
     used = known_a & known_b & (weight > 0.05) & (depth > 0) & (inv_b > 0)
-    return float(np.median(depth[used] * inv_b[used])) if used.sum() >= MIN_COMMON else None
+    if used.sum() < MIN_COMMON:
+        return None
+    return Sim3.from_rigid(j_from_i).in_lengths(1 / float(np.median(depth[used] * inv_b[used])))
 
 
-def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, scale: float) -> None:
-    """Bring j's submap into the world of i's, by the pose of j against i and the scale; they are one from here on.
+def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> None:
+    """Bring j's submap into the world of i's; they are one from here on.
 
-    ``j_from_i`` (4, 4) in i's lengths; ``scale``: i's lengths per length of j's submap.
+    ``j_from_i``: from points of camera i, in the lengths of its submap, to those of camera j in the lengths of its own.
     """
     keep, gone = graph.submap_of[i], graph.submap_of[j]
-    cam_from_a = j_from_i @ graph.variables[i].cam_from_world
-    cam_from_b = graph.variables[j].cam_from_world
-    stretched = cam_from_b.copy()
-    stretched[:3, 3] *= scale
-    b_from_a = inverse(stretched) @ cam_from_a  # both in a's lengths
+    cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (i, j))
     moved = graph.members(gone)
-    graph.rescale(moved, scale)
+    graph.transform_keyframes(moved, cam_i.inverse() @ j_from_i.inverse() @ cam_j)
     for k in moved:
-        block = graph.variables[k]
-        block.cam_from_world = block.cam_from_world @ b_from_a
         graph.submap_of[k] = keep
     graph.started.discard(gone)
     if graph.submap == gone:
@@ -74,7 +70,7 @@ def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
         own = [n for n, r in enumerate(graph.records) if r.kf_id in ids and r.state != "lost"]
         before = [r for r in graph.records[: own[0]] if r.kf_id not in ids and r.state != "lost"]
         for n in own:
-            graph.records[n].state = "interpolated"
+            graph.set_record_state(graph.records[n], "interpolated")
         out.append((graph.records[own[0]].index, graph.records[own[-1]].index))
         if not before:
             continue
@@ -84,6 +80,6 @@ def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
         ahead = min((first.timestamp_s - last.timestamp_s) / span_s, MOST_AHEAD)
         guess = se3_exp(ahead * se3_log(now @ inverse(then))) @ now
         i, j = last.kf_id, first.kf_id
-        scale = graph.median_inv_depth(j) / graph.median_inv_depth(i)
-        join(graph, i, j, guess @ inverse(graph.variables[i].cam_from_world), float(scale))
+        j_from_i = Sim3.from_rigid(guess @ inverse(graph.variables[i].cam_from_world))
+        join(graph, i, j, j_from_i.in_lengths(graph.median_inv_depth(i) / graph.median_inv_depth(j)))
     return out

@@ -14,8 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..geometry.quaternion import quaternion_from_rotation
 from ..geometry.se3 import inverse
-from .gaussians import Array, GaussianMap, quaternion_from_rotation, quaternion_product
+from ..geometry.sim3 import Sim3
+from .gaussians import Array, GaussianMap, quaternion_product
 
 RAY_SHARE = 0.2  # what a view says of depth, as a share of what it says across its ray
 ANCHOR_PX = 1.0  # the anchor counts as a view in which the Gaussian covers this many pixels
@@ -27,29 +29,26 @@ FIT_PRIOR = 0.3  # holds a pose correction near none: mean square error in the i
 class Visibility:
     """How much of one view's picture each Gaussian makes up, and what the correction does to what it shows."""
 
-    change: Array  # (4, 4) new_world_from_old_world, a similarity
+    change: Sim3  # new_world_from_old_world
     cam_from_world: Array  # (4, 4) that the view was trained with, before the correction
     weight_px: torch.Tensor  # (n,) sum of blending weights over the pixels
 
 
-def changes_of(old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> dict[int, Array]:
-    """(4, 4) of each keyframe in both dicts: its new pose over its old one, new_world_from_old_world."""
+def changes_of(old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> dict[int, Sim3]:
+    """Of each keyframe in both dicts, new_world_from_old_world: its new pose (4, 4) over its old one."""
     both = sorted(set(old_world_from_kf) & set(new_world_from_kf))
-    return {
-        kf: np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(np.asarray(old_world_from_kf[kf], float))
-        for kf in both
-    }
+    return {kf: Sim3.from_rigid(new_world_from_kf[kf] @ np.linalg.inv(old_world_from_kf[kf])) for kf in both}
 
 
-def deformation(changes: Iterable[Array], point: Array) -> float:
+def deformation(changes: Iterable[Sim3], point: Array) -> float:
     """How far apart the changes would put one point: the largest distance from the mean. 0 for a rigid correction."""
-    moved = np.stack([c[:3, :3] @ point + c[:3, 3] for c in changes])
+    moved = np.stack([change.apply(point) for change in changes])
     return float(np.linalg.norm(moved - moved.mean(0), axis=1).max())
 
 
 def visibility(
     gaussians: GaussianMap,
-    change: Array,
+    change: Sim3,
     cam_from_world: torch.Tensor,
     intrinsics: torch.Tensor,
     pixel_weight: torch.Tensor,
@@ -67,7 +66,7 @@ def visibility(
     return Visibility(change, cam_from_world.detach().cpu().numpy(), weight_px[:, 0].detach())
 
 
-def followed(gaussians: GaussianMap, changes: dict[int, Array], visibilities: Iterable[Visibility]) -> GaussianMap:
+def followed(gaussians: GaussianMap, changes: dict[int, Sim3], visibilities: Iterable[Visibility]) -> GaussianMap:
     """The map after a correction, each Gaussian moved by the mean of what its sights say.
 
     Its centre: least squares over the views, where a view counts by its pixels, and along its ray only by
@@ -75,8 +74,7 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], visibilities: It
     with its anchor, and so do harmonics. Where all changes are equal, so is the motion. Keyframes without a change
     stand still.
     """
-    identity = {int(kf): np.eye(4) for kf in gaussians.kf_id.unique().cpu().numpy()}
-    anchored = gaussians.moved(identity, changes)
+    anchored = gaussians.moved(changes)
     before, device = gaussians.means.detach().double(), gaussians.means.device
     eye = torch.eye(3, dtype=torch.float64, device=device)
     anchor_turn, anchor_scale = _anchor_motion(gaussians, changes)
@@ -87,7 +85,8 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], visibilities: It
     for seen in visibilities:
         change, weight, centre_ = seen.change, seen.weight_px.double(), inverse(seen.cam_from_world)[:3, 3]
         linear, offset, centre = (
-            torch.from_numpy(np.array(a, float)).to(device) for a in (change[:3, :3], change[:3, 3], centre_)
+            torch.from_numpy(np.array(a, float)).to(device)
+            for a in (change.matrix[:3, :3], change.translation, centre_)
         )
         ray = torch.nn.functional.normalize(before - centre, dim=1)
         across = (1 + RAY_SHARE) * eye - ray[:, :, None] * ray[:, None, :]
@@ -95,8 +94,10 @@ def followed(gaussians: GaussianMap, changes: dict[int, Array], visibilities: It
         motion = before @ linear.T + offset - before
         total = total + information
         shift = shift + (information @ motion[..., None])[..., 0]
-        quaternion, scale = _turn_and_scale(change)
-        step = torch.from_numpy(quaternion).to(device)
+        step, scale = (
+            torch.from_numpy(quaternion_from_rotation(change.rotation)).to(device),
+            float(np.log(change.scale)),
+        )
         step = step * torch.where((anchor_turn @ step) < 0, -1.0, 1.0)[:, None]
         turn, log_scale, pixels = turn + weight[:, None] * step, log_scale + weight * scale, pixels + weight
     means = before + torch.linalg.solve(total, shift)
@@ -134,16 +135,11 @@ def fitted_pose(before_cam: Array, after_cam: Array, weight: Array, depth: float
     return found[:3], found[3:]
 
 
-def _turn_and_scale(change: Array) -> tuple[Array, float]:
-    """(4,) wxyz and the logarithm of the scale of a similarity."""
-    scale = float(np.cbrt(np.linalg.det(change[:3, :3])))
-    return quaternion_from_rotation(change[:3, :3] / scale), float(np.log(scale))
-
-
-def _anchor_motion(gaussians: GaussianMap, changes: dict[int, Array]) -> tuple[torch.Tensor, torch.Tensor]:
+def _anchor_motion(gaussians: GaussianMap, changes: dict[int, Sim3]) -> tuple[torch.Tensor, torch.Tensor]:
     """(n, 4) turn and (n,) logarithm of the scale of every Gaussian's anchor."""
     found, row = np.unique(gaussians.kf_id.cpu().numpy(), return_inverse=True)
-    motions = [_turn_and_scale(changes.get(int(kf), np.eye(4))) for kf in found]
-    turns, scales = np.stack([m[0] for m in motions])[row], np.array([m[1] for m in motions])[row]
+    motions = [changes.get(int(kf), Sim3.identity()) for kf in found]
+    turns = quaternion_from_rotation(np.stack([m.rotation for m in motions]))[row]
+    scales = np.log([m.scale for m in motions])[row]
     device = gaussians.means.device
     return torch.from_numpy(turns).to(device), torch.from_numpy(scales).to(device)

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..geometry.quaternion import quaternion_from_rotation
+from ..geometry.sim3 import Sim3
 from ..registry import AUTO
 from .rasterise import rasterization
 from .screen import ScreenStats
@@ -108,26 +110,23 @@ class GaussianMap:
             backend=self.backend,
         )
 
-    def moved(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> GaussianMap:
-        """The map after a graph correction: every Gaussian keeps its place in its keyframe's camera.
+    def moved(self, changes: dict[int, Sim3]) -> GaussianMap:
+        """The map after a graph correction: every Gaussian goes with its keyframe, new_world_from_old_world.
 
-        Keyframes that are missing in either dict do not move. Poses are (4, 4); a scale in their
-        rotation block is honoured.
+        What hangs on keyframes without a change does not move.
         """
         names = ("means", "quats", "log_scales", "sh_rest")
         means, quats, log_scales, sh_rest = (getattr(self, name).detach().clone() for name in names)
-        for kf in sorted(set(old_world_from_kf) & set(new_world_from_kf)):
+        for kf, change in sorted(changes.items()):
             rows = torch.nonzero(self.kf_id == kf)[:, 0]
             if len(rows) == 0:
                 continue
-            change = np.asarray(new_world_from_kf[kf], float) @ np.linalg.inv(np.asarray(old_world_from_kf[kf], float))
-            scale = float(np.cbrt(np.linalg.det(change[:3, :3])))
-            linear, shift = (torch.from_numpy(c.copy()) for c in (change[:3, :3], change[:3, 3]))
-            means[rows] = (means[rows].double() @ linear.T.to(means.device) + shift.to(means.device)).to(means)
-            turn = torch.from_numpy(quaternion_from_rotation(change[:3, :3] / scale)).to(quats)
+            matrix = torch.from_numpy(change.matrix).to(means.device)
+            means[rows] = (means[rows].double() @ matrix[:3, :3].T + matrix[:3, 3]).to(means)
+            turn = torch.from_numpy(quaternion_from_rotation(change.rotation)).to(quats)
             quats[rows] = quaternion_product(turn, quats[rows])
-            log_scales[rows] += float(np.log(scale))
-            sh_rest[rows] = sh_turned(sh_rest[rows], change[:3, :3] / scale)
+            log_scales[rows] += float(np.log(change.scale))
+            sh_rest[rows] = sh_turned(sh_rest[rows], change.rotation)
         tensors = zip(names, (means, quats, log_scales, sh_rest), strict=True)
         return replace(self, **{name: t.requires_grad_() for name, t in tensors})
 
@@ -161,19 +160,3 @@ def quaternion_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
         aw * bz + ax * by - ay * bx + az * bw,
     ]
     return torch.stack(parts, -1)
-
-
-def quaternion_from_rotation(rotation: Array) -> Array:
-    """(3, 3) rotation to (4,) wxyz: eigenvector of Bar-Itzhack's symmetric matrix, stable at every angle."""
-    m = np.asarray(rotation, float)
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [0, m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [0, 0, m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [0, 0, 0, m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    _, vectors = np.linalg.eigh(k, UPLO="U")
-    quaternion = vectors[:, -1]
-    return quaternion if quaternion[0] >= 0 else -quaternion

@@ -14,6 +14,7 @@ from ..concurrency import one_torch_thread
 from ..config import MappingConfig
 from ..errors import ConfigError, InputError
 from ..geometry.se3 import inverse, transform
+from ..geometry.sim3 import Sim3
 from ..types import StaticCloud, View
 from .adam import RowAdam
 from .correction import Visibility, changes_of, deformation, fitted_pose, followed, visibility
@@ -151,27 +152,27 @@ class Mapper:
         changes = changes_of(old_world_from_kf, new_world_from_kf)
         if not changes:
             return
-        hung = [changes.get(v.kf_id, np.eye(4)) for v in self._views]
+        hung = [changes.get(v.kf_id, Sim3.identity()) for v in self._views]
         middle = self._map.means.detach().double().median(0).values.cpu().numpy()
         before, views = self._map, self._view_parameters
         if deformation(hung, middle) <= BEND_RATIO * self._depth:
-            self._map = before.moved(old_world_from_kf, new_world_from_kf)
-            views.move_keyframes(old_world_from_kf, new_world_from_kf)
+            self._map = before.moved(changes)
+            views.move_keyframes(changes)
             return
         visibilities = dict(self._sights(hung))
         trained_with = [views.cam_from_world(n).detach().numpy() for n in range(len(self._views))]
         self._map = followed(before, changes, visibilities.values())
-        views.move_keyframes(old_world_from_kf, new_world_from_kf)
+        views.move_keyframes(changes)
         if self.config.refine_poses:
             self._fit_poses(before, trained_with, visibilities)
 
-    def _sights(self, changes: list[Array]) -> Iterator[tuple[int, Visibility]]:
+    def _sights(self, changes: list[Sim3]) -> Iterator[tuple[int, Visibility]]:
         """What a part of the views sees of the map now; ``changes`` are those of all views' keyframes."""
         for number in _evenly(range(len(self._views)), MAX_SIGHTS):
             view, (_, weight) = self._views[number], self._target(number)
             K = torch.from_numpy(view.camera.matrix).to(self._device)
             pose = self._view_parameters.cam_from_world(number).detach()
-            refined = inverse(self._view_parameters.tracked_cam_from_world(number)) @ pose.numpy()
+            refined = Sim3.from_rigid(inverse(self._view_parameters.tracked_cam_from_world(number)) @ pose.numpy())
             yield number, visibility(self._map, changes[number] @ refined, pose, K, weight, self._near)
 
     def _fit_poses(self, before: GaussianMap, trained_with: list[Array], visibilities: dict[int, Visibility]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ..geometry.sim3 import Sim3
 from ..types import View
 from .adam import RowAdam
 from .gaussians import Array
@@ -93,16 +94,13 @@ class ViewParameters:
         rates = {"log_gain": _EXPOSURE_RATE, "bias": _EXPOSURE_RATE, "shift": pose_rate, "turn": pose_rate}
         self._adams[number].step(self._rows[number], rates)
 
-    def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
-        """Views follow their keyframes; a scale in the correction moves their centres only."""
+    def move_keyframes(self, changes: dict[int, Sim3]) -> None:
+        """Views follow their keyframes, new_world_from_old_world; a scale moves their centres only."""
         for i, kf in enumerate(self._kf_id):
-            if kf not in old_world_from_kf or kf not in new_world_from_kf:
-                continue
-            change = new_world_from_kf[kf] @ np.linalg.inv(old_world_from_kf[kf])
-            pose = change @ self._world_from_cam[i]
-            pose[:3, :3] /= np.cbrt(np.linalg.det(pose[:3, :3]))
-            self._world_from_cam[i] = pose
-            self._cam_from_world[i] = torch.from_numpy(np.linalg.inv(pose))
+            if kf in changes:
+                pose = (changes[kf] @ Sim3.from_rigid(self._world_from_cam[i])).rigid
+                self._world_from_cam[i] = pose
+                self._cam_from_world[i] = torch.from_numpy(np.linalg.inv(pose))
 
     def _motion(self, shift: torch.Tensor, turn: torch.Tensor) -> torch.Tensor:
         """(4, 4) float64: the exponential of SE(3)."""

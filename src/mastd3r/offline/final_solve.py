@@ -64,7 +64,7 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
             out.append(FinalFrame(record, np.full((4, 4), np.nan), "lost"))
             continue
         guess = np.eye(4) if record.is_keyframe else _refined(graph, record, guess)
-        record.cam_from_kf = guess
+        graph.set_record_pose(record, guess)
         cam_from_world = guess @ graph.variables[record.kf_id].cam_from_world
         out.append(FinalFrame(record, inverse(cam_from_world), record.state))
     return _bridged(out)

@@ -41,7 +41,7 @@ class MaskReweighting:
         for r in graph.records:
             anchor = self._anchors.get(r.kf_id)
             at_keyframe = np.float32(1) if anchor is None else anchor[r.points]
-            r.weight = r.weight * self._targets.get(r.index, np.float32(1)) * at_keyframe
+            graph.set_weights(r, r.weight * self._targets.get(r.index, np.float32(1)) * at_keyframe)
 
 
 def _static(moving: Array, px: Array) -> Array:

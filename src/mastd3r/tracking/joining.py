@@ -7,7 +7,7 @@ import logging
 from ..concurrency import Future
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
-from ..graph.submaps import join, scale_between
+from ..graph.submaps import join, with_scale
 from .covisibility import CovisibilityEdges
 from .two_view import TwoViewEstimator
 
@@ -30,11 +30,12 @@ def join_recognised(
         if view is None:
             continue
         pose = view.alignment.new_from_ref
-        scale = scale_between(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
-        if scale is None:
+        kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
+        if kf_from_other is None:
             continue
+        scale = 1 / kf_from_other.scale
         log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
-        join(graph, other.id, kf.id, pose, scale)
+        join(graph, other.id, kf.id, kf_from_other)
         around = range(max(0, other.id - MATCHED_AROUND), min(len(graph.keyframes), other.id + MATCHED_AROUND + 1))
         for k in around:
             if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from ..concurrency import Future
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
+from ..geometry.sim3 import Sim3
 from ..graph.covisibility import overlaps
 from ..graph.keyframe_graph import KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
-from ..graph.submaps import scale_between
+from ..graph.submaps import with_scale
 from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
@@ -46,7 +47,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
             loop = _loop(graph, other.id, j, there, back)
             if loop is None or there is None or back is None:
                 continue
-            log.info("keyframes %d and %d are one place, scale %.3f", other.id, j, loop.scale)
+            log.info("keyframes %d and %d are one place, scale %.3f", other.id, j, 1 / loop.j_from_i.scale)
             graph.connect(other.id, j, there.pair.matches, static_at(kf.moving / 255.0, there.pair.matches.new_px))
             graph.connect(j, other.id, back.pair.matches, static_at(other.moving / 255.0, back.pair.matches.new_px))
             found.append(loop)
@@ -72,20 +73,20 @@ def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: Two
     """What j seen from i and i seen from j agree on; None where they do not."""
     if there is None or back is None or not (_strong(there) and _strong(back)):
         return None
-    j_from_i, i_from_j = there.alignment.new_from_ref, back.alignment.new_from_ref
-    scale = scale_between(graph, i, j, j_from_i, there.pair.matches, there.weight)
-    other = scale_between(graph, j, i, i_from_j, back.pair.matches, back.weight)
-    if scale is None or other is None or abs(np.log(scale * other)) > MAX_LOG_SCALE:
+    j_from_i = with_scale(graph, i, j, there.alignment.new_from_ref, there.pair.matches, there.weight)
+    i_from_j = with_scale(graph, j, i, back.alignment.new_from_ref, back.pair.matches, back.weight)
+    if j_from_i is None or i_from_j is None or abs(np.log(j_from_i.scale * i_from_j.scale)) > MAX_LOG_SCALE:
         return None
     better = there if there.alignment.inlier_ratio >= back.alignment.inlier_ratio else back
-    turn = np.linalg.norm(so3_log(i_from_j[:3, :3] @ j_from_i[:3, :3]))
+    turn = np.linalg.norm(so3_log(i_from_j.rotation @ j_from_i.rotation))
     if better.alignment.inlier_ratio < SURE_INLIERS or turn > MAX_TURN:
         return None
-    scale = float(np.sqrt(scale / other))
+    scale = float(np.sqrt(j_from_i.scale / i_from_j.scale))
     if better is back:
-        j_from_i = inverse(i_from_j)
-        j_from_i[:3, 3] *= scale
-    return Loop(i, j, j_from_i, scale, float(better.weight.sum()))
+        j_from_i = Sim3.from_rigid(inverse(back.alignment.new_from_ref), scale)
+    else:
+        j_from_i = Sim3.from_rigid(there.alignment.new_from_ref).in_lengths(scale)
+    return Loop(i, j, j_from_i, float(better.weight.sum()))
 
 
 def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:

@@ -1,0 +1,65 @@
+"""Which part of a graph is optimised at once: the last keyframes, one keyframe's depths, or everything."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.reprojection_kernels import N_GLOBAL
+from .factors import ReprojectionFactor
+from .intrinsics import LATE, RADIAL, Intrinsics
+
+if TYPE_CHECKING:
+    from .keyframe_graph import KeyframeGraph
+
+Array = NDArray[Any]
+ALL_INTRINSICS = frozenset(range(N_GLOBAL))
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of a graph, and what of it stays as it is."""
+
+    ids: Collection[int]  # keyframes, in the order of their rows in the system
+    edges: list[ReprojectionFactor]  # between those
+    fixed: frozenset[int]  # keyframes whose pose stays
+    held: frozenset[int]  # intrinsics that stay, indices into g
+
+    def prior_info(self, intrinsics: Intrinsics) -> Array:
+        """(6,) information of the intrinsics' priors, inf for those that are held."""
+        return np.where(np.isin(np.arange(N_GLOBAL), list(self.held)), np.inf, intrinsics.prior_info)
+
+
+def sliding(graph: KeyframeGraph) -> tuple[Window, bool]:
+    """The last ``window`` keyframes and what they are matched with, which holds them; True where that is all."""
+    ids, size = graph.members(), graph.config.window
+    n, active = len(ids), set(ids[-size:])
+    edges = [e for e in graph.edges if e.i in active]
+    near = active | {e.j for e in edges}
+    whole = len(near) == n and n <= size
+    fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
+    moves = n <= 2 * size or n % 4 == 0
+    early = RADIAL if len(graph.keyframes) < graph.config.radial_keyframes else ()
+    return Window(sorted(near), edges, fixed, _held(graph, early if moves else ALL_INTRINSICS)), whole
+
+
+def depths_of(graph: KeyframeGraph, kf_id: int) -> Window:
+    """One keyframe's depths, from the edges that it has."""
+    edges = [e for e in graph.edges if e.i == kf_id]
+    near = sorted({kf_id, *(e.j for e in edges)})
+    return Window(near, edges, frozenset(near), ALL_INTRINSICS)
+
+
+def everything(graph: KeyframeGraph) -> Window:
+    """Every keyframe; the first of each submap stays."""
+    return Window(graph.variables.keys(), graph.edges, frozenset(graph.roots()), _held(graph, ()))
+
+
+def _held(graph: KeyframeGraph, named: Iterable[int]) -> frozenset[int]:
+    """Those named, and those that too few views cannot tell apart."""
+    late = LATE if len(graph.keyframes) < graph.config.lens_keyframes else ()
+    return frozenset(named) | frozenset(late)
