@@ -18,13 +18,12 @@ import torch
 from mastd3r.config import Config
 from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
-from mastd3r.graph.place_recognition import PlaceRecognition
 from mastd3r.networks.dinov2 import Dinov2Features
 from mastd3r.networks.foreground import ForegroundPrior
 from mastd3r.networks.matching import RecordedMatching, match_pixels
 from mastd3r.networks.pair import PairNetwork
 from mastd3r.offline.final_solve import final_frames, trajectory_of
-from mastd3r.parts import Parts
+from mastd3r.parts import parts_of
 from mastd3r.pointmap.mast3r import Mast3rPointmaps, match_on_host, working_size_of
 from mastd3r.pointmap.matching import FoundPixels, MatchOptions, subsampled
 from mastd3r.slam import Slam
@@ -209,50 +208,50 @@ def _tracked(
     width, height = working_size_of(truth, clip.size)
     matcher = _matcher_of(truth.network)
     most = 4 if b.device.type == "cpu" else 24
-    provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, matcher=matcher, remembered_pairs=most)
-    places = PlaceRecognition(provider.place_descriptor)
-    parts = Parts(
-        provider, (width, height), places=places, own_scale_known=False, prefetches_pairs=b.device.type != "cpu"
-    )
-    parts.semantic = semantic
-    slam = Slam(config, parts, clip.size)
+    options = {"matcher": matcher, "remembered_pairs": most, "prefetches_pairs": b.device.type != "cpu"}
+    provider = Mast3rPointmaps(truth, width, height, config.tracking.cell_px, **options)
+    parts = parts_of(provider, config)
+    if semantic is not None:
+        parts.semantics.fill = semantic
+    slam = Slam(config, clip.size, parts=parts)
     truth.encoded = truth.decoded = 0
     stages: dict[str, list[float]] = defaultdict(list)
     reports = []
-    with _watched(stages, truth, parts, slam):
+    with _watched(stages, truth, slam):
         start = time.perf_counter()
-        for frame in parts.prefetched(islice(clip.photographs(), frames), slam.near):
-            reports.append(slam.step(frame))
+        for frame in slam.prefetched(islice(clip.photographs(), frames)):
+            reports.append(slam.track(frame))
         b.wait()
         seconds = time.perf_counter() - start
     error = ate_rmse(trajectory_of(final_frames(slam.graph)), clip.truth)
+    states = [r.state for r in slam.graph.records]
     ms = {name: round(1e3 * sum(values) / frames, 2) for name, values in stages.items()}
     return {
         "frames": frames, "seconds": round(seconds, 3), "per_s": round(frames / seconds, 2),
         "encoded": truth.encoded, "decoded": truth.decoded,
         "keyframes": sum(r.is_keyframe for r in reports), "ate_rmse_m": error.rmse and round(error.rmse, 5),
-        "states": {s: sum(r.state == s for r in reports) for s in sorted({r.state for r in reports})},
+        "states": {s: states.count(s) for s in sorted(set(states))},
         "stage_ms_a_frame": dict(sorted(ms.items(), key=lambda item: -item[1])), **b.peak(),
     }  # fmt: skip
 
 
 @contextmanager
-def _watched(stages: dict[str, list[float]], truth: TruthNetwork, parts: Parts, slam: Slam) -> Iterator[None]:
+def _watched(stages: dict[str, list[float]], truth: TruthNetwork, slam: Slam) -> Iterator[None]:
     """Time of the stages, host side, each with what it calls; a stage that waits for the device has its time too."""
-    import mastd3r.compare as compare_module
-
-    provider = parts.provider
+    provider, keyframes, graph = slam.parts.provider, slam.keyframes, slam.graph
     watched: list[tuple[Any, str, str]] = [
         (truth, "prepare", "network: prepare"), (truth, "encode", "network: encode"),
         (truth, "pairs", "network: pairs"),
-        (provider, "matcher", "pair: match pixels"), (parts, "observe", "observe (waits for what is looked at ahead)"),
+        (provider, "matcher", "pair: match pixels"),
+        (slam.observer, "observe", "observe (waits for what is looked at ahead)"),
         (provider, "look", "ahead: look, encode"), (provider, "beside", "ahead: decode, own depth"),
-        (provider, "predict", "pair: predict"), (slam.belief, "prior", "beside: mask, prior"),
-        (slam.belief, "update", "beside: mask, update"), (slam.comparer, "compare", "compare (predict, align)"),
-        (compare_module, "align", "pair: align"), (slam, "_add_keyframe", "keyframe: add"),
-        (slam, "_changes_to_known", "keyframe: known place"), (slam.graph, "solve_window", "keyframe: solve window"),
-        (slam.graph, "solve_all", "keyframe: solve all"), (slam.graph, "record", "record"),
-        (slam, "step", "whole step"),
+        (provider, "predict", "pair: predict"), (slam.masks.filter, "prior", "beside: mask, prior"),
+        (slam.masks.filter, "update", "beside: mask, update"), (slam.two_view, "match", "frame: predict, weigh"),
+        (slam.aligner, "coarse", "pair: coarse"), (slam.aligner, "scale", "pair: scale"),
+        (slam.aligner, "fine", "pair: fine"), (keyframes, "_add", "keyframe: add"),
+        (keyframes, "_known_place", "keyframe: known place"), (graph, "solve_window", "keyframe: solve window"),
+        (graph, "solve_all", "keyframe: solve all"), (graph, "record", "record"),
+        (slam, "track", "whole step"),
     ]  # fmt: skip
     before = [(o, attribute, o.__dict__.get(attribute)) for o, attribute, _ in watched]
     for o, attribute, name in watched:

@@ -29,7 +29,7 @@ from mastd3r.config import Config
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.geometry.se3 import inverse
-from mastd3r.parts import Parts
+from mastd3r.parts import Parts, parts_of
 from mastd3r.pointmap.geometric import working_size
 from mastd3r.registry import ALIGNMENT
 from mastd3r.slam import Slam
@@ -43,8 +43,8 @@ VARIANTS = ("printed", "ours")
 class FrontEnd(Slam):
     """Tracking without the joint optimisation: a keyframe stays where its alignment put it."""
 
-    def __init__(self, config: Config, parts: Parts, full_size: tuple[int, int]) -> None:
-        super().__init__(config, parts, full_size)
+    def __init__(self, config: Config, parts: Parts, source: Source) -> None:
+        super().__init__(config, source.size, source=source, parts=parts)
         self.graph.solve_window = lambda: None  # type: ignore[assignment,method-assign,return-value]
         self.graph.solve_depths = lambda *_: None  # type: ignore[method-assign]
         self.graph.solve_all = lambda *_: None  # type: ignore[assignment,method-assign,return-value]
@@ -54,12 +54,13 @@ class FrontEnd(Slam):
 def tracked(source: Source, config: Config, errors: NetworkErrors, seed: int) -> dict[str, Any]:
     """ATE of the path as tracked, and how it went."""
     size = working_size(*source.size, config.tracking.area_px)
-    parts = Parts(DisturbedDepthPointmaps(*size, config.tracking.cell_px, errors, seed), size)
-    slam = FrontEnd(config, parts, source.size)
+    parts = parts_of(DisturbedDepthPointmaps(*size, config.tracking.cell_px, errors, seed), config)
+    slam = FrontEnd(config, parts, source)
     poses, stamps, states = [], [], []
     for frame in source.frames():
-        states.append(slam.step(frame).state)
+        slam.track(frame)
         record = slam.graph.records[-1]
+        states.append(record.state)
         poses.append(inverse(record.cam_from_kf @ slam.graph.variables[record.kf_id].cam_from_world))
         stamps.append(frame.timestamp_s)
     path = Trajectory(np.array(stamps), np.stack(poses), tuple(states), np.zeros(len(poses), bool))

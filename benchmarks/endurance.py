@@ -24,7 +24,6 @@ from mastd3r.config import Config, SourceConfig
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.offline.final_solve import final_frames, finish_graph, trajectory_of
-from mastd3r.parts import build_parts
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.types import Frame, Source, Trajectory, Truth
@@ -75,15 +74,15 @@ def measure(source: Source, what: str, config: Config) -> dict[str, Any]:
     """Track one arrangement and say how it went."""
     order, black = order_of(what, source.length or 0)
     arranged = Reordered(source, order, black)
-    slam = Slam(config, build_parts(config, source), source.size)
+    slam = Slam(config, source.size, source=source)
     step_s, memory, keyframes = [], [], []
     for frame in arranged.frames():
         began = time.process_time()
-        slam.step(frame)
+        slam.track(frame)
         step_s.append(time.process_time() - began)
         memory.append(rss_mib())
         keyframes.append(len(slam.graph.keyframes))
-    slam.close()
+    slam.end_tracking()
     finish_graph(slam.graph, config)
     trajectory = trajectory_of(final_frames(slam.graph))
     ate = ate_rmse(trajectory, arranged.truth())

@@ -32,8 +32,8 @@ from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.machine import machine_info
 from mastd3r.export.pictures import mask_overlay
 from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
-from mastd3r.offline.smoothing import FrameMask, Look, smooth_masks
-from mastd3r.parts import build_parts
+from mastd3r.offline.smoothing import FrameMask, SmoothingContext, smooth_masks
+from mastd3r.registry import DYNAMICS
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.types import Source
@@ -154,13 +154,12 @@ class Tracked:
         self.source: Source = open_source(
             folder, config.source, want_depth=False, want_semantic=task.semantics == "maps", semantic_dir=maps
         )
-        parts = build_parts(config, self.source)
-        self.slam = Slam(config, parts, self.source.size)
+        self.slam = Slam(config, self.source.size, source=self.source)
         frames, clock, cpu = 0, time.perf_counter(), time.process_time()
-        for frame in parts.prefetched(self.source.frames(), self.slam.near):
-            self.slam.step(frame)
+        for frame in self.slam.prefetched(self.source.frames()):
+            self.slam.track(frame)
             frames += 1
-        self.slam.close()
+        self.slam.end_tracking()
         self.frame_s = (time.perf_counter() - clock) / frames
         self.frame_cpu_s = (time.process_time() - cpu) / frames
         finish_graph(self.slam.graph, config)
@@ -199,10 +198,11 @@ class Tracked:
                 each(seen)
 
         map_view = MapView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
-        known = self.slam.belief.appearance
+        known = self.slam.masks.filter.appearance
         learned = None if known is None else known.copy()
-        look = Look(self.final, self.slam.graph, self.slam.parts, config, map_view, appearance=learned)
-        smooth_masks(islice(self.source.frames(), *(frames or (None,))), look, on_mask)
+        parts = replace(self.slam.parts, dynamics=DYNAMICS.create(config.dynamics.variant, config.dynamics))
+        context = SmoothingContext(self.final, self.slam.graph, parts, config, map_view, appearance=learned)
+        smooth_masks(islice(self.source.frames(), *(frames or (None,))), context, on_mask)
         found = mask_error(pairs)
         return {"iou": found.iou, "false_positives": found.false_positive_ratio, "moving": found.called_moving_ratio}
 

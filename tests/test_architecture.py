@@ -184,6 +184,20 @@ def test_heavy_packages_stay_where_they_are_needed() -> None:
     assert not wrong
 
 
+def test_threads_are_made_in_one_file() -> None:
+    """Locks and what a thread keeps for itself may stand anywhere; the command line watches its standard input."""
+    makers = {"concurrent", "ThreadPoolExecutor", "Thread"}
+    allowed = {"concurrency", "cli.commands"}
+    naming = {
+        dotted(path)
+        for path in MODULES
+        for node in ast.walk(tree(path))
+        if {ast.Name: "id", ast.Attribute: "attr"}.get(type(node)) is not None
+        and getattr(node, "id", getattr(node, "attr", "")) in makers
+    }
+    assert naming == allowed
+
+
 def test_files_are_short() -> None:
     lengths = {str(p.relative_to(ROOT)): len(p.read_text(encoding="utf-8").splitlines()) for p in WRITTEN}
     assert {name: n for name, n in lengths.items() if n > MAX_FILE_LINES} == {}

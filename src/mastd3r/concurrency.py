@@ -145,6 +145,14 @@ S = TypeVar("S")
 _BESIDE = ThreadPoolExecutor(1, "every other")
 
 
+_HALVES = ThreadPoolExecutor(2, "halves")
+
+
+def in_halves(make: Callable[[slice], T], count: int) -> list[T]:
+    """``make`` of the first and of the second half of 0 … count-1, at once. It must not call this again."""
+    return list(_HALVES.map(make, (slice(None, count // 2), slice(count // 2, None))))
+
+
 def on_two_threads(make: Callable[[S], T], items: Sequence[S]) -> list[T]:
     """``make`` of every item, in order; every other one is made in a thread beside, always the same ones.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..concurrency import Worker
 from .appearance import AppearanceClassifier
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput, check_image, check_input
@@ -48,7 +48,7 @@ class LogOddsFilter:
         self._past: deque[Past] = deque(maxlen=max(config.temporal.filter_gaps, default=1))
         self._log_odds: Array | None = None  # of the evidence at half size, without the semantic prior
         self._arrival: _Arrival | None = None
-        self._beside = ThreadPoolExecutor(1, "depth")
+        self._worker = Worker("depth")
 
     def prior(self, gray: Array, semantic: Array | None = None, features: Array | None = None) -> Array:
         """P(moving) (h, w) float32 before the pose is known: the last posterior along the flow, semantics, appearance.
@@ -84,7 +84,7 @@ class LogOddsFilter:
         terms: dict[str, Array] = {}
         depth = None
         if self.config.depth.enabled and frame.own_inv_depth is not None:
-            depth = self._beside.submit(lambda: self.refinement.shrink(depth_log_ratio(frame, self.config)))
+            depth = self._worker.submit(lambda: self.refinement.shrink(depth_log_ratio(frame, self.config)))
         gaps = sorted({min(g, len(self._past)) for g in self.config.temporal.filter_gaps} - {0})
         if self.config.motion.enabled and gaps:
             static = 1 - sigmoid(carried)
@@ -94,7 +94,7 @@ class LogOddsFilter:
             if gaps[0] == 1:  # a better flow than the one prior() had
                 carried = self._carry(arrival.gray, found[0].flow, arrival.texture)
         if depth is not None:
-            terms["depth"] = depth.result()
+            terms["depth"] = depth.get()
             fresh = with_depth(fresh, terms["depth"])
         terms["time"] = carried
         return fresh, carried, terms

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
+from ..concurrency import Worker
 from ..geometry.se3 import inverse
 from .config import DynamicsConfig
 from .data import DynamicsInput
@@ -69,7 +69,7 @@ class MotionTest:
         self._flow = flow
         self._camera: Camera | None = None
         self._rays = np.zeros((3, height, width), np.float32)
-        self._beside = ThreadPoolExecutor(1, "compare")
+        self._worker = Worker("compare")
 
     def present(self, frame: DynamicsInput, small: Array, texture: Information) -> Present:
         """What ``compare`` is to know of a frame; ``small`` is its (h, w) uint8 grey image."""
@@ -83,9 +83,9 @@ class MotionTest:
 
         Every other one beside, always the same ones: what a flow engine finds may hang on what it was shown before.
         """
-        beside = self._beside.submit(lambda: [self._one(*pair) for pair in pairs[1::2]])
+        beside = self._worker.submit(lambda: [self._one(*pair) for pair in pairs[1::2]])
         found = [self._one(*pair) for pair in pairs[::2]]
-        for n, other in enumerate(beside.result()):
+        for n, other in enumerate(beside.get()):
             found.insert(2 * n + 1, other)
         return found
 

@@ -35,12 +35,6 @@ def guided_coefficients(guide: Array, value: Array, weight: Array, radius_px: in
     return box(a * share, radius_px) / norm, box(b * share, radius_px) / norm
 
 
-def guided(guide: Array, value: Array, weight: Array, radius_px: int, edge: float) -> Array:
-    """``value`` (h, w) float32 smoothed inside the edges of ``guide``; pixels of weight 0 are filled in."""
-    a, b = guided_coefficients(guide, value, weight, radius_px, edge)
-    return a * guide + b
-
-
 def region_mean(guide: Array, value: Array, weight: Array, radius_px: float, edge: float) -> Array:
     """Weighted mean of ``value`` over the region that each pixel belongs to, (h, w) float32.
 

@@ -7,15 +7,15 @@ Baker & Matthews, "Lucas-Kanade 20 years on", IJCV 2004 (inverse compositional, 
 from __future__ import annotations
 
 import math
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from ..concurrency import in_halves
+
 Array = NDArray[Any]
-_POOL = ThreadPoolExecutor(2, "patches")
 _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", "nogil": True}
 LEAST_VARIANCE = 0.25  # grey², of a patch that can be found again
 LEAST_GRADIENT = 0.05  # grey²/px², trace of the normal matrix
@@ -117,9 +117,7 @@ def align_patches(
     ref: Array, new: Array, px: Array, start: Array, affine: Array, weight: Array, iterations: int
 ) -> tuple[Array, Array]:
     """``align_some`` on two threads: each patch is by itself, so the answer is the same."""
-    half = len(px) // 2
-    parts = [slice(None, half), slice(half, None)]
-    found = list(_POOL.map(lambda s: align_some(ref, new, px[s], start[s], affine[s], weight, iterations), parts))
+    found = in_halves(lambda s: align_some(ref, new, px[s], start[s], affine[s], weight, iterations), len(px))
     return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
 
 
