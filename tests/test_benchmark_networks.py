@@ -32,5 +32,7 @@ def test_every_part_that_a_cpu_can_do(room_clip: Path, tmp_path: Path) -> None:
     loop = result["parts"]["loop"]
     assert loop["loop"]["states"] == {"started": 1, "tracked": 5} and loop["loop"]["encoded"] == 6
     assert loop["loop"]["ate_rmse_m"] < 0.01 and loop["loop_over_network"] > 0
-    assert {"pair: align", "beside: mask, update", "network: pairs"} < set(loop["loop"]["stage_ms_a_frame"])
+    assert {"pair: coarse", "pair: fine", "beside: mask, update", "network: pairs"} < set(
+        loop["loop"]["stage_ms_a_frame"]
+    )
     assert "loop_over_network" in done.stdout and "pixels of the loop" in done.stdout

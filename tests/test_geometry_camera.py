@@ -45,6 +45,8 @@ def test_project_and_rays_are_inverse(camera: Camera) -> None:
     assert (rays[:, 2] == 1).all()
     depth = np.linspace(0.1, 50, len(px))[:, None]
     np.testing.assert_allclose(camera.project(rays * depth), px, atol=1e-3)
+    np.testing.assert_allclose(camera.unproject(px, 1 / depth[:, 0]), rays * depth, rtol=1e-12)
+    assert camera.unproject(px[0], np.float64(0.5)).shape == (3,)
 
 
 @QUICK
@@ -169,7 +171,7 @@ def test_three_terms_go_from_solver_to_camera_and_back(terms: tuple[float, float
     assert np.abs(camera.project(rays) - px).max() < 0.05
     assert np.abs(camera.rays(px) - rays).max() * focal_px < 0.1
     again = bent_lens(inverse_radial(focal_px, (camera.k1, camera.k2, camera.k3), size), focal_px, size)
-    again.g[2:4] = lens.values[2:4]
+    again.values[2:4] = lens.values[2:4]
     assert np.abs(undistorted(again, px) - rays).max() * focal_px < 0.1
 
 

@@ -251,13 +251,13 @@ def plane_at(px: Array) -> Array:
     return CAMERA.rays(px) @ PLANE
 
 
-def test_trust_is_half_at_a_tenth() -> None:
+def test_confidence_is_half_at_a_tenth() -> None:
     depth = np.array([0.5, 2.0])
     np.testing.assert_allclose(depth_confidence(depth, 1 / (0.1 * depth) ** 2), 0.5)
     assert depth_confidence(depth, np.full(2, 1e9)).min() > 0.99 and depth_confidence(depth, np.zeros(2)).max() < 1e-9
 
 
-def test_filling_keeps_what_is_known_and_bridges_the_rest(exact_scene: Callable[..., Any]) -> None:
+def test_inpainting_keeps_what_is_known_and_bridges_the_rest(exact_scene: Callable[..., Any]) -> None:
     scene = exact_scene(1)
     truth = plane_at(scene.px)
     rng = np.random.default_rng(0)
@@ -288,9 +288,9 @@ def test_carrying_a_plane_into_another_view(exact_scene: Callable[..., Any]) -> 
     n = motion[:3, :3] @ PLANE
     truth = CAMERA.rays(at) @ n / (1 + n @ motion[:3, 3])
     args = (scene.px, plane_at(scene.px))
-    value, trusted = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at)
+    value, confidence = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at)
     assert np.median(np.abs(value / truth - 1)) < 0.01 and np.abs(value / truth - 1).max() < 0.05
-    assert np.median(trusted) > 0.8
+    assert np.median(confidence) > 0.8
     away = carried(*args, np.full(len(scene.px), 1e6), motion, CAMERA, at + np.array([600, 0]))[1]
     assert away.max() < 0.01
     _, unknown = carried(*args, np.zeros(len(scene.px)), motion, CAMERA, at)

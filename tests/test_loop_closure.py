@@ -167,7 +167,7 @@ class Recognises:
         weight[int(self.spoilt.get("matches", len(weight))) :] = 0.0
         nothing = Pointmap(matches.ref_px, np.zeros((len(weight), 3)), np.zeros(len(weight)))
         flow = np.zeros((self.scene.height, self.scene.width, 2), np.float32)
-        alignment = Alignment(pose, 1.0, True, 3, inliers, 0.3, ("fine",))
+        alignment = Alignment(pose, 1.0, True, inliers, 0.3, ("fine",))
         return TwoView(kf, PairPrediction(matches, nothing, None, flow), weight, alignment, 0.1, 200)
 
 

@@ -18,6 +18,7 @@ from .camera.pinhole import Camera
 
 Array = NDArray[Any]
 State = Literal["started", "tracked", "interpolated", "lost"]
+USABLE_WEIGHT = 0.05  # a match, or a pixel that may be matched, that weighs less says nothing
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..config import AlignmentConfig
 from ..geometry.sim3 import procrustes
 from ..protocols import Aligner
-from ..types import PairPrediction
+from ..types import USABLE_WEIGHT, PairPrediction
 from .coarse import icp, resect
 from .fine import OwnPoints, align_fine
 from .problem import AlignmentProblem
@@ -36,17 +36,16 @@ class CoarseToFine:
         """Eq. (8): ICP of both clouds, or of the static points in the image where new has no cloud of its own."""
         matches, guess = problem.matches, problem.guess
         if matches is None:
-            return Alignment(guess, 1.0, True, 0, 1.0, 0.0, ("flow only",))
+            return Alignment(guess, 1.0, True, 1.0, 0.0, ("flow only",))
         if matches.count < self.config.min_matches:
             few = f"too few static matches ({matches.count} < {self.config.min_matches})"
             return Alignment.failed(guess, few)
         own = _own_points(problem.pair, matches, problem.sigma_ratio)
         pose = _raw(matches, own, guess)
         if not self.use_coarse:
-            return Alignment(pose, 1.0, True, 0, 0.0, float("inf"), ("raw",))
+            return Alignment(pose, 1.0, True, 0.0, float("inf"), ("raw",))
         found = resect(matches, pose) if own is None else icp(own.ref, own.new, own.weight, pose)
-        stages = ("raw", "coarse")
-        return Alignment(found.new_from_ref, 1.0, found.converged, found.iterations, 0.0, float("inf"), stages)
+        return Alignment(found.new_from_ref, 1.0, found.converged, 0.0, float("inf"), ("raw", "coarse"))
 
     def scale(self, problem: AlignmentProblem, coarse: Alignment) -> Alignment:
         """Eq. (9)(10): new's lengths brought to the map's, and the clouds aligned once more."""
@@ -81,7 +80,6 @@ class CoarseToFine:
                 new_from_ref=fine.new_from_ref,
                 scale=scale,
                 converged=fine.converged,
-                iterations=scaled.iterations + fine.iterations,
                 stages=(*scaled.stages, "fine"),
             )
         inlier_ratio, error_px = matches.quality(found.new_from_ref)
@@ -117,7 +115,7 @@ def _own_points(pair: PairPrediction, matches: StaticMatches, sigma_ratio: float
     if pair.new_own is None or sigma_ratio is None:
         return None
     weight = matches.weight * (pair.new_own.confidence > 0) * (pair.ref.confidence > 0)
-    if (weight > 0.05).sum() < 30:
+    if (weight > USABLE_WEIGHT).sum() < 30:
         return None
     return OwnPoints(pair.ref.points, pair.new_own.points, weight, sigma_ratio)
 

@@ -22,7 +22,6 @@ class IcpReport:
 
     new_from_ref: Array  # (4, 4)
     converged: bool
-    iterations: int
     inlier_ratio: float
 
 
@@ -35,12 +34,12 @@ def icp(points_ref: Array, points_new: Array, weight: Array, new_from_ref: Array
     """
     used = weight > 0
     if used.sum() < 6:
-        return IcpReport(new_from_ref, False, 0, 0.0)
+        return IcpReport(new_from_ref, False, 0.0)
     a, b, w = points_ref[used], points_new[used], weight[used]
     tree = cKDTree(b)
-    pose, converged, done, inlier_ratio = new_from_ref, False, 0, 0.0
+    pose, converged, inlier_ratio = new_from_ref, False, 0.0
     pair = np.arange(len(a))
-    for done in range(1, iterations + 1):
+    for _ in range(iterations):
         moved = transform(pose, a)
         distance = np.linalg.norm(moved - b[pair], axis=1) / np.maximum(b[pair, 2], 1e-9)
         scale = max(2.0 * float(np.median(distance)), 1e-4)
@@ -56,7 +55,7 @@ def icp(points_ref: Array, points_new: Array, weight: Array, new_from_ref: Array
         if change < 1e-5:
             converged = True
             break
-    return IcpReport(pose, converged, done, inlier_ratio)
+    return IcpReport(pose, converged, inlier_ratio)
 
 
 def resect(matches: StaticMatches, guess: Array) -> IcpReport:
@@ -68,4 +67,4 @@ def resect(matches: StaticMatches, guess: Array) -> IcpReport:
     wide = solve_pose(matches, guess, kernel_px=8.0, iterations=15)
     near = solve_pose(matches, wide.new_from_ref, kernel_px=3.0, iterations=10)
     inlier_ratio, _ = matches.quality(near.new_from_ref)
-    return IcpReport(near.new_from_ref, near.converged, wide.iterations + near.iterations, inlier_ratio)
+    return IcpReport(near.new_from_ref, near.converged, inlier_ratio)

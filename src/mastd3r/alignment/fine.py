@@ -14,6 +14,7 @@ from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.point_kernels import point_system
 from ..geometry.reprojection_kernels import pose_system
 from ..geometry.se3 import se3_exp, transform
+from ..types import USABLE_WEIGHT
 from .reproject import PoseReport, StaticMatches
 
 Array = NDArray[Any]
@@ -84,7 +85,7 @@ class _Terms:
         if self.own is None or not self.as_printed:
             m = self.matches
             args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
-            hess[:6, :6], rhs[:6], cost = pose_system(*args, pose, m.lens, self.kernel_px)
+            hess[:6, :6], rhs[:6], cost = pose_system(*args, pose, m.intrinsics, self.kernel_px)
         if self.own is None:
             return hess, rhs, cost
         for h, b, c in self._points(self.own, pose, log_scale):
@@ -96,7 +97,7 @@ class _Terms:
 
     def _points(self, own: OwnPoints, pose: Array, log_scale: float) -> list[tuple[Array, Array, float]]:
         """Point to point, and Chamfer."""
-        used = own.weight > 0.05
+        used = own.weight > USABLE_WEIGHT
         moved, scaled, w = transform(pose, own.ref[used]), np.exp(log_scale) * own.new[used], own.weight[used]
         sigma = own.sigma_ratio * np.maximum(scaled[:, 2], 1e-6)
         parts = [point_terms(moved, scaled, w, sigma)]
@@ -148,5 +149,4 @@ def align_fine(
     start = _PoseAndScale(terms, new_from_ref, float(np.log(scale)))
     found = levenberg_marquardt(start, Damping(), iterations=iterations, tolerance=1e-5)
     end = found.estimate
-    report = PoseReport(end.new_from_ref, end.linearised()[0][:6, :6], found.iterations, found.converged)
-    return report, float(np.exp(end.log_scale))
+    return PoseReport(end.new_from_ref, found.converged), float(np.exp(end.log_scale))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.reprojection_kernels import MIN_DEPTH, edge_residuals, pose_system
 from ..geometry.se3 import se3_exp
+from ..types import USABLE_WEIGHT
 
 Array = NDArray[Any]
 
@@ -25,16 +26,16 @@ class StaticMatches:
     depth_info: Array  # (p,) 1/variance of it, unit pixel noise
     target: Array  # (p, 2) in new
     weight: Array  # (p,)
-    lens: Array  # (6,) log f, k, cx, cy, m, n
+    intrinsics: Array  # (6,) log f, k, cx, cy, m, n
 
     @property
     def count(self) -> int:
         """Matches that say something."""
-        return int((self.weight > 0.05).sum())
+        return int((self.weight > USABLE_WEIGHT).sum())
 
     def residual_px(self, new_from_ref: Array) -> Array:
         """(p,) norm of the re-mapping residual; 1e3 behind the camera."""
-        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.lens)
+        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.intrinsics)
         return np.where(z < MIN_DEPTH, 1e3, np.hypot(r[:, 0], r[:, 1]))
 
     def quality(self, new_from_ref: Array) -> tuple[float, float]:
@@ -42,11 +43,11 @@ class StaticMatches:
 
         A depth that is not known yet is free: only the residual across the epipolar line counts then.
         """
-        used = self.weight > 0.05
+        used = self.weight > USABLE_WEIGHT
         if not used.any():
             return 0.0, float("inf")
-        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.lens)
-        r_far, _ = edge_residuals(self.px, self.inv_depth * 1.02 + 1e-4, self.target, new_from_ref, self.lens)
+        r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.intrinsics)
+        r_far, _ = edge_residuals(self.px, self.inv_depth * 1.02 + 1e-4, self.target, new_from_ref, self.intrinsics)
         along = (r_far - r) / (0.02 * self.inv_depth + 1e-4)[:, None]
         share = 1.0 / (self.depth_info + (along**2).sum(1) + 1e-12)
         squared = (r**2).sum(1) - (r * along).sum(1) ** 2 * share
@@ -59,8 +60,6 @@ class PoseReport:
     """A pose from re-mapping residuals."""
 
     new_from_ref: Array  # (4, 4)
-    information: Array  # (6, 6)
-    iterations: int
     converged: bool
 
 
@@ -76,7 +75,7 @@ class _Pose:
     def _system(self) -> tuple[Array, Array, float]:
         m = self.matches
         args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
-        found: tuple[Array, Array, float] = pose_system(*args, self.new_from_ref, m.lens, self.kernel_px)
+        found: tuple[Array, Array, float] = pose_system(*args, self.new_from_ref, m.intrinsics, self.kernel_px)
         return found
 
     def linearised(self) -> tuple[Array, Array, float]:
@@ -94,5 +93,4 @@ def solve_pose(matches: StaticMatches, new_from_ref: Array, *, kernel_px: float,
     without depth still fixes rotation and the direction across its epipolar line."""
     start = _Pose(matches, kernel_px, new_from_ref)
     found = levenberg_marquardt(start, Damping(), iterations=iterations, tolerance=1e-5)
-    pose = found.estimate
-    return PoseReport(pose.new_from_ref, pose.linearised()[0], found.iterations, found.converged)
+    return PoseReport(found.estimate.new_from_ref, found.converged)

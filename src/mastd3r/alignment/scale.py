@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.se3 import transform
+from ..types import USABLE_WEIGHT
 
 Array = NDArray[Any]
 
@@ -19,7 +20,7 @@ def patch_scale(depth_pre: Array, depth_new: Array, patch: Array, weight: Array,
     Args: depth_pre, depth_new (n,) of the same surface points; patch (n,) integer patch of each; weight (n,).
     Returns 1.0 where no patch has ``min_points`` weighted points.
     """
-    used = (weight > 0.05) & (depth_pre > 0) & (depth_new > 0)
+    used = (weight > USABLE_WEIGHT) & (depth_pre > 0) & (depth_new > 0)
     _, patch = np.unique(patch[used], return_inverse=True)
     count = np.bincount(patch)
     many = count >= min_points

@@ -87,6 +87,10 @@ class Camera:
                 x = xd / (1 + r2 * (self.k1 + r2 * (self.k2 + self.k3 * r2)))
         return np.concatenate([x, np.ones_like(x[..., :1])], -1)
 
+    def unproject(self, px: Array, inv_depth: Array) -> Array:
+        """(..., 2) pixels and their inverse depths (...), not 0, to (..., 3) points."""
+        return self.rays(px) / inv_depth[..., None]
+
     def pixel_grid(self) -> Array:
         """(h, w, 2) float64 pixel centres."""
         x, y = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))

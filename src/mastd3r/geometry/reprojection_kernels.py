@@ -1,6 +1,6 @@
 """Numba kernels of the joint optimisation: residuals and Jacobians of flow matches (docs/joint_optimisation.md).
 
-A host keyframe i owns inverse depths d at its grid pixels. A match of grid pixel x in keyframe j at x' gives
+An anchor keyframe i owns inverse depths d at its grid pixels. A match of grid pixel x in keyframe j at x' gives
 
     u(x)  = e · (1 + k |e|² + m |e|⁴ + n |e|⁶),  e = (x - c)/f   undistortion, unit plane
     Y     = R u(x) + t d,   (R, t) = j_from_i                  u(x) homogeneous
@@ -23,7 +23,7 @@ _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy",
 N_GLOBAL = 6
 N_POSE = 6
 N_COLS = N_POSE + N_GLOBAL
-MIN_DEPTH = 0.02  # Y_z below this share of the host's depth: the point is (nearly) behind the camera
+MIN_DEPTH = 0.02  # Y_z below this share of the anchor's depth: the point is (nearly) behind the camera
 
 
 @nb.njit(inline="always", **_JIT)
@@ -105,7 +105,7 @@ def _lens_columns(
     qy: float,
     t: Array,
 ) -> None:
-    """Columns 6 to 11 of d(f q) through the host's ray u(x); s2 v, s2² v, s2³ v: k, m, n at the other end."""
+    """Columns 6 to 11 of d(f q) through the anchor's ray u(x); s2 v, s2² v, s2³ v: k, m, n at the other end."""
     p00 = fz * (t[0, 0] - qx * t[2, 0])
     p01 = fz * (t[0, 1] - qx * t[2, 1])
     p10 = fz * (t[1, 0] - qy * t[2, 0])
@@ -190,9 +190,9 @@ def _edge_point(
 def anchor_system(
     px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Normal-equation parts of all m edges of one host.
+    """Normal-equation parts of all m edges of one anchor keyframe.
 
-    Args: px (p, 2) host pixels; depth (p,) inverse depths; target (m, p, 2) pixels in j; weight (m, p);
+    Args: px (p, 2) pixels of it; depth (p,) inverse depths; target (m, p, 2) pixels in j; weight (m, p);
         j_from_i (m, 4, 4); g (6,) intrinsics; kernel_px scale of the Cauchy kernel.
     Returns: H (m, 12, 12), b (m, 12), E (m, p, 12) = w J^T J_d, H_dd (m, p), b_d (m, p), cost (m,).
     """
@@ -237,9 +237,9 @@ def anchor_system(
 
 @nb.njit(**_JIT)
 def anchor_columns(cross: Array, to_anchor: Array) -> Array:
-    """(p, 12 + 6 m) of one host: ``cross`` (m, p, 12) of its edges in the columns [pose i, pose j1 … jm, lens].
+    """(p, 12 + 6 m) of one anchor keyframe: ``cross`` (m, p, 12) of its edges, in other columns.
 
-    ``to_anchor`` (m, 6, 6): pose i's columns are those of pose j times it.
+    They are [pose i, pose j1 … jm, intrinsics]. ``to_anchor`` (m, 6, 6): pose i's columns are those of pose j times it.
     """
     m, p = cross.shape[0], cross.shape[1]
     out = np.zeros((p, 6 + 6 * m + N_GLOBAL))

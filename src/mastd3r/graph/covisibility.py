@@ -21,10 +21,10 @@ def overlap(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[float,
 
 def overlaps(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[Array, Array]:
     """The same for m views (m, 4, 4): shares (m,) and motions (m,), inf where nothing is in view."""
-    block, camera = graph.variables[i], graph.camera().pinhole
-    px = block.px[::4]
-    points = camera.rays(px) / block.inv_depth[::4, None]
-    view_from_ref = cam_from_world @ inverse(block.cam_from_world)
+    v, camera = graph.variables[i], graph.camera().pinhole
+    px = v.px[::4]
+    points = camera.unproject(px, v.inv_depth[::4])
+    view_from_ref = cam_from_world @ inverse(v.cam_from_world)
     moved = points @ view_from_ref[:, :3, :3].transpose(0, 2, 1) + view_from_ref[:, None, :3, 3]
     front = moved[..., 2] > 1e-3
     seen = camera.project(np.where(front[..., None], moved, 1.0).reshape(-1, 3)).reshape(*front.shape, 2)

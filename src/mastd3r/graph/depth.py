@@ -13,6 +13,7 @@ from ..camera.pinhole import Camera
 from ..geometry.se3 import transform
 
 Array = NDArray[Any]
+LEAST_CONFIDENCE = 0.05  # a depth that is known less well is not carried on
 
 
 def depth_confidence(inv_depth: Array, info: Array) -> Array:
@@ -21,16 +22,16 @@ def depth_confidence(inv_depth: Array, info: Array) -> Array:
 
 
 def inpainted(inv_depth: Array, info: Array, grid: tuple[int, int]) -> Array:
-    """(p,) inverse depths with the unknown ones replaced by their known neighbours (normalised convolution)."""
-    t = depth_confidence(inv_depth, info).reshape(grid).astype(np.float32)
-    d = inv_depth.reshape(grid).astype(np.float32)
-    smooth = np.full(grid, np.float32(np.average(d, weights=t + 1e-6)))
+    """(p,) inverse depths, those of low confidence inpainted from their neighbours (normalised convolution)."""
+    confidence = depth_confidence(inv_depth, info).reshape(grid).astype(np.float32)
+    depth = inv_depth.reshape(grid).astype(np.float32)
+    smooth = np.full(grid, np.float32(np.average(depth, weights=confidence + 1e-6)))
     for sigma in (8.0, 4.0, 2.0, 1.0):
-        weight = cv2.GaussianBlur(t, (0, 0), sigma)
-        value = cv2.GaussianBlur(t * d, (0, 0), sigma) / np.maximum(weight, 1e-9)
+        weight = cv2.GaussianBlur(confidence, (0, 0), sigma)
+        value = cv2.GaussianBlur(confidence * depth, (0, 0), sigma) / np.maximum(weight, 1e-9)
         share = np.minimum(weight / 0.15, 1.0)
         smooth = share * value + (1 - share) * smooth
-    return (t * d + (1 - t) * smooth).astype(float).reshape(-1)
+    return (confidence * depth + (1 - confidence) * smooth).astype(float).reshape(-1)
 
 
 def upsampled(values: Array, grid: tuple[int, int], width: int, height: int) -> Array:
@@ -45,19 +46,19 @@ def upsampled(values: Array, grid: tuple[int, int], width: int, height: int) -> 
 def carried(
     px: Array, inv_depth: Array, info: Array, new_from_ref: Array, camera: Camera, at_px: Array
 ) -> tuple[Array, Array]:
-    """Inverse depth (q,) and trust (q,) at ``at_px`` of a new view, from ref's points: the 3 nearest, by distance.
+    """Inverse depth (q,) and confidence (q,) at ``at_px`` of a new view, from ref's points: the 3 nearest, by distance.
 
-    A point behind the camera, or seen edge-on from far away in the image, has no say (trust 0).
+    A point behind the camera, or seen edge-on from far away in the image, has no say (confidence 0).
     """
-    points = transform(new_from_ref, camera.rays(px) / np.maximum(inv_depth, 1e-9)[:, None])
-    t = depth_confidence(inv_depth, info)
-    ok = (points[:, 2] > 1e-3 / np.maximum(inv_depth.max(), 1e-9)) & (t > 0.05)
+    points = transform(new_from_ref, camera.unproject(px, np.maximum(inv_depth, 1e-9)))
+    confidence = depth_confidence(inv_depth, info)
+    ok = (points[:, 2] > 1e-3 / np.maximum(inv_depth.max(), 1e-9)) & (confidence > LEAST_CONFIDENCE)
     if ok.sum() < 8:
         return np.full(len(at_px), float(np.median(inv_depth))), np.zeros(len(at_px))
     landed, new_inv = camera.project(points[ok]), 1 / points[ok][:, 2]
     found = cKDTree(landed).query(at_px, k=3)
     distance, nearest = np.asarray(found[0]), np.asarray(found[1])
-    weight = t[ok][nearest] / (distance + 1.0)
+    weight = confidence[ok][nearest] / (distance + 1.0)
     value = (new_inv[nearest] * weight).sum(1) / weight.sum(1)
     near = np.exp(-((distance[:, 0] / 24.0) ** 2))
-    return value, near * t[ok][nearest[:, 0]]
+    return value, near * confidence[ok][nearest[:, 0]]

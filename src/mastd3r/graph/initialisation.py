@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..geometry.reprojection_kernels import N_GLOBAL, edge_residuals
 from ..geometry.se3 import inverse
+from ..types import USABLE_WEIGHT
 from .depth import carried
 from .factors import ReprojectionFactor
 from .intrinsics import Intrinsics
@@ -26,7 +27,7 @@ FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 SAME = 0.01  # starts whose focal lengths and costs differ by less came to the same end
 FITS_PX = 1.0  # a match further away counts as left out
 FOCAL_DOUBT = 0.1  # share of the matches that a focal length e times the usual one must explain more than the others
-FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the lens is not given
+FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the intrinsics are not given
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ def bootstrap(whole: KeyframeGraph) -> bool:
 
     Several first pairs and focal lengths are tried, each to the end; the start that explains the most matches is
     kept, and matches that it leaves out lose their weight: nothing else tells yet what moves. World is the submap's
-    first keyframe's camera. A lens that an earlier submap has found stays as it is.
+    first keyframe's camera. Intrinsics that an earlier submap has found stay as they are.
     """
     graph = whole.part()
     if whole.started:
@@ -145,7 +146,7 @@ def _errors_px(graph: KeyframeGraph) -> list[Array]:
 def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
     """Matches far from the start lose their weight; (p,) share that every keyframe's points keep, 1 without any."""
     errors = _errors_px(graph)
-    used = np.concatenate([r[e.weight > 0.05] for e, r in zip(graph.edges, errors, strict=True)])
+    used = np.concatenate([r[e.weight > USABLE_WEIGHT] for e, r in zip(graph.edges, errors, strict=True)])
     bound_px = max(3.0, 5.0 * float(np.median(used)))  # a lens that is bent more than known moves the most
     kept = {k: np.zeros((2, len(v.px))) for k, v in graph.variables.items()}
     for e, r in zip(graph.edges, errors, strict=True):
@@ -157,7 +158,7 @@ def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
 
 def _agreement(graph: KeyframeGraph) -> float:
     """Share of all weighted matches within 2 px of where poses and depths put them."""
-    used = [e.weight > 0.05 for e in graph.edges]
+    used = [e.weight > USABLE_WEIGHT for e in graph.edges]
     close = sum(int((r[u] < 2.0).sum()) for r, u in zip(_errors_px(graph), used, strict=True))
     return close / max(sum(int(u.sum()) for u in used), 1)
 
@@ -166,7 +167,7 @@ def _first_pairs(graph: KeyframeGraph) -> list[ReprojectionFactor]:
     """Pairs to start from: many matches and much image motion, best first."""
 
     def merit(edge: ReprojectionFactor) -> float:
-        used = edge.weight > 0.05
+        used = edge.weight > USABLE_WEIGHT
         moved = np.linalg.norm(edge.target - graph.variables[edge.i].px, axis=1)[used]
         return float(used.sum() * min(np.median(moved) / (0.05 * max(graph.size)), 1.5))
 

@@ -36,10 +36,11 @@ RADIAL, LATE = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what wai
 PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 
 
-def camera_of(lens: Intrinsics, size: tuple[int, int]) -> Camera:
-    """The camera (width, height) that a lens stands for; radial terms fitted to the undistortion of the solver."""
-    f, cx, cy = float(np.exp(lens.values[0])), float(lens.values[2]), float(lens.values[3])
-    return Camera(f, f, cx, cy, *size, *inverse_radial(f, tuple(lens.values[list(RADIAL)]), size))
+def camera_of(intrinsics: Intrinsics, size: tuple[int, int]) -> Camera:
+    """The camera (width, height) that they stand for; radial terms fitted to the undistortion of the solver."""
+    g = intrinsics.values
+    f, cx, cy = float(np.exp(g[0])), float(g[2]), float(g[3])
+    return Camera(f, f, cx, cy, *size, *inverse_radial(f, tuple(g[list(RADIAL)]), size))
 
 
 def inverse_radial(focal_px: float, terms: tuple[float, ...], size: tuple[int, int]) -> tuple[float, ...]:
@@ -59,7 +60,7 @@ def inverse_radial(focal_px: float, terms: tuple[float, ...], size: tuple[int, i
 
 
 def intrinsics_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int, int]) -> Intrinsics:
-    """The lens before anything is seen: given intrinsics fixed, otherwise centred with wide priors.
+    """Intrinsics before anything is seen: fixed where they are given, otherwise centred with wide priors.
 
     The optimisation knows one focal length, so fx and fy are joined by their geometric mean.
     """

@@ -17,7 +17,7 @@ from ..camera.pinhole import Camera
 from ..config import GraphConfig
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
-from ..types import Matches, State, WorkFrame
+from ..types import USABLE_WEIGHT, Matches, State, WorkFrame
 from .bundle_adjustment import SolveReport, solve
 from .factors import KeyframeVariables, ReprojectionFactor
 from .intrinsics import Intrinsics, camera_of
@@ -140,7 +140,7 @@ class KeyframeGraph:
         inv_depth: Array,
         prior_info: Array,
     ) -> Keyframe:
-        """Store a keyframe with a first pose and first depths (p,); ``prior_info`` is how far those are trusted."""
+        """Store a keyframe with a first pose and first depths (p,); ``prior_info`` (p,) is that of the depths."""
         kf = Keyframe(len(self.keyframes), work, static, np.rint(255 * moving).astype(np.uint8))
         self.size = (work.gray.shape[1], work.gray.shape[0])
         self.keyframes.append(kf)
@@ -157,7 +157,7 @@ class KeyframeGraph:
         """
         weight = matches.weight * self.keyframes[i].static * static_new
         least = 0.0 if followed else self.config.min_match_ratio
-        if (weight > 0.05).mean() < least or (weight > 0.05).sum() < 20:
+        if (weight > USABLE_WEIGHT).mean() < least or (weight > USABLE_WEIGHT).sum() < 20:
             return None
         return ReprojectionFactor(i, j, matches.new_px, weight)
 
@@ -180,7 +180,7 @@ class KeyframeGraph:
         """Store a frame's place; its strongest matches are kept for the final pose."""
         keep = np.zeros(0, int)
         if matches is not None:
-            strong = np.flatnonzero(weight > 0.05)
+            strong = np.flatnonzero(weight > USABLE_WEIGHT)
             keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
         target = np.zeros((0, 2), np.float32) if matches is None else matches.new_px[keep].astype(np.float32)
         entry = FrameRecord(

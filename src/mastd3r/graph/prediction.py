@@ -22,11 +22,11 @@ def rigid_flow(graph: KeyframeGraph, i: int, j: int) -> Array:
 
 def rigid_flow_to(graph: KeyframeGraph, i: int, cam_from_world: Array) -> Array:
     """(h, w, 2) flow of a static scene from keyframe i into a view; computed a cell, interpolated between."""
-    kf, block, camera = graph.keyframes[i], graph.variables[i], graph.camera()
-    inv_depth = inpainted(block.inv_depth, graph.depth_info(i), kf.work.grid)
+    kf, v, camera = graph.keyframes[i], graph.variables[i], graph.camera()
+    inv_depth = inpainted(v.inv_depth, graph.depth_info(i), kf.work.grid)
     centres = cell_centres(kf.work.grid, *graph.size)
-    j_from_i = cam_from_world @ inverse(block.cam_from_world)
-    points = transform(j_from_i, camera.rays(centres) / np.maximum(inv_depth, 1e-6)[:, None])
+    j_from_i = cam_from_world @ inverse(v.cam_from_world)
+    points = transform(j_from_i, camera.unproject(centres, np.maximum(inv_depth, 1e-6)))
     points[:, 2] = np.maximum(points[:, 2], 1e-2 / float(np.median(inv_depth)))
     limit = 2.0 * max(graph.size)
     flow = np.clip(camera.project(points) - centres, -limit, limit)

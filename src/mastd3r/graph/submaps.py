@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..geometry.se3 import inverse, se3_exp, se3_log
 from ..geometry.sim3 import Sim3
-from ..types import Matches
+from ..types import USABLE_WEIGHT, Matches
 from .depth import depth_confidence
 from .keyframe_graph import KeyframeGraph
 
@@ -28,7 +28,7 @@ def with_scale(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: M
     """
     a, b, grid = graph.variables[i], graph.variables[j], graph.keyframes[j].work.grid
     known_a = depth_confidence(a.inv_depth, graph.depth_info(i)) > 0.5
-    points = graph.camera().rays(a.px) / np.maximum(a.inv_depth, 1e-9)[:, None]
+    points = graph.camera().unproject(a.px, np.maximum(a.inv_depth, 1e-9))
     depth = points @ j_from_i[2, :3] + j_from_i[2, 3]
     cell_px = min(graph.size[0] // grid[1], graph.size[1] // grid[0])
     at = matches.new_px / cell_px - 0.5 + 0.5 / cell_px
@@ -36,7 +36,7 @@ def with_scale(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: M
     inv_b = cv2.remap(b.inv_depth.reshape(grid).astype(np.float32), xy, None, cv2.INTER_NEAREST)[:, 0]
     confidence_b = depth_confidence(b.inv_depth, graph.depth_info(j)).reshape(grid).astype(np.float32)
     known_b = cv2.remap(confidence_b, xy, None, cv2.INTER_NEAREST)[:, 0] > 0.5
-    used = known_a & known_b & (weight > 0.05) & (depth > 0) & (inv_b > 0)
+    used = known_a & known_b & (weight > USABLE_WEIGHT) & (depth > 0) & (inv_b > 0)
     if used.sum() < MIN_COMMON:
         return None
     return Sim3.from_rigid(j_from_i).in_lengths(1 / float(np.median(depth[used] * inv_b[used])))

@@ -200,7 +200,7 @@ def _seen_by(
         px = block.px
     else:
         cam_from_kf = inverse(place.world_from_cam) @ graph.world_from_cam(kf_id)
-        points = transform(cam_from_kf, camera.rays(block.px) / np.maximum(block.inv_depth, 1e-9)[:, None])
+        points = transform(cam_from_kf, camera.unproject(block.px, np.maximum(block.inv_depth, 1e-9)))
         in_front = points[:, 2] > 0
         px = np.where(in_front[:, None], camera.project(np.where(in_front[:, None], points, 1.0)), -1e3)
     inside = (px > -0.5).all(1) & (px[:, 0] < camera.width - 0.5) & (px[:, 1] < camera.height - 0.5)

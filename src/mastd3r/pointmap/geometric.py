@@ -92,8 +92,7 @@ class SensorDepthPointmaps(GeometricPointmaps):
 def points_from_own_depth(frame: WorkFrame, px: Array, weight: Array, camera: Camera) -> Pointmap:
     """A frame's own measured depth at ``px`` as points in its own camera; confidence 0 where it has none."""
     inv_depth = sample_own(frame, px)
-    rays = camera.rays(px)
-    points = rays / np.maximum(inv_depth, 1e-6)[:, None]
+    points = camera.unproject(px, np.maximum(inv_depth, 1e-6))
     return Pointmap(px, points, np.where(inv_depth > 0, weight, 0.0))
 
 

@@ -18,6 +18,7 @@ from ..graph.keyframe_graph import KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
+from ..types import USABLE_WEIGHT
 from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
@@ -64,7 +65,7 @@ def _known(found: list[Loop], i: int, j: int) -> bool:
 
 
 def _strong(view: TwoView | None) -> bool:
-    if view is None or (view.weight > 0.05).sum() < MIN_MATCHES:
+    if view is None or (view.weight > USABLE_WEIGHT).sum() < MIN_MATCHES:
         return False
     return view.alignment.inlier_ratio >= MIN_INLIERS
 

@@ -17,7 +17,7 @@ from ..config import Config
 from ..dynamics.soft_mask import static_at
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..parts import Parts
-from ..types import Guess, Matches, PairPrediction, WorkFrame
+from ..types import USABLE_WEIGHT, Guess, Matches, PairPrediction, WorkFrame
 from .observation import Observation
 from .state import TrackingState
 
@@ -94,7 +94,7 @@ class TwoViewEstimator:
 
     def accepted(self, view: TwoView) -> bool:
         """Enough static matches, and enough of them agree on the pose."""
-        enough = (view.weight > 0.05).sum() >= self.config.alignment.min_matches
+        enough = (view.weight > USABLE_WEIGHT).sum() >= self.config.alignment.min_matches
         return bool(enough) and view.alignment.inlier_ratio >= self.config.tracking.min_inlier_ratio
 
     def relocalised(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> TwoView | None:
@@ -123,11 +123,11 @@ def matched_share(ref: Keyframe, weight: Array) -> float:
 
     Small after a fast turn, or with someone in front.
     """
-    return int((weight > 0.05).sum()) / max(int((ref.work.texture * ref.static > 0.05).sum()), 1)
+    return int((weight > USABLE_WEIGHT).sum()) / max(int((ref.work.texture * ref.static > USABLE_WEIGHT).sum()), 1)
 
 
 def _motion(matches: Matches, weight: Array, size: tuple[int, int], share: float) -> tuple[float, int]:
-    used = weight > 0.05
+    used = weight > USABLE_WEIGHT
     if used.sum() < 10:
         return float("inf"), 0
     moved = np.linalg.norm(matches.new_px - matches.ref_px, axis=1)[used]
