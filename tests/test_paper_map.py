@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import re
 import tokenize
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ CODE_SPAN = re.compile(r"`([^`]*\.py[^`]*)`")
 
 def table() -> dict[str, list[tuple[str, str]]]:
     """First cell of each row -> its entries (file, name)."""
-    rows = [line for line in TEXT.splitlines() if line.startswith("| ") and "`" in line]
+    rows = [line for line in TEXT.partition("## The newcomer")[0].splitlines() if line.startswith("| ") and "`" in line]
     return {row.split("|")[1].strip(): ENTRY.findall(row) for row in rows}
 
 
@@ -63,5 +64,33 @@ def test_the_algorithm_is_named_where_it_is() -> None:
 
 def test_no_entry_is_misspelt() -> None:
     """Whatever looks like a file of the package is an entry that the tests above check."""
-    spans = [s for s in CODE_SPAN.findall(TEXT) if not s.startswith("tests/")]
+    spans = [s for s in CODE_SPAN.findall(TEXT.partition("## The newcomer")[0]) if not s.startswith("tests/")]
     assert [s for s in spans if not ENTRY.fullmatch(f"`{s}`")] == []
+
+
+def newcomers_paths() -> dict[str, list[str]]:
+    """First cell of each row of the newcomer's path -> the files opened after slam.py."""
+    rows = [line.split("|") for line in TEXT.partition("## The newcomer")[2].splitlines() if line.startswith("| ")]
+    return {
+        cells[1].strip(): CODE_SPAN.findall(cells[2]) for cells in rows if ".py" in cells[2] and "slam" not in cells[2]
+    }
+
+
+def test_a_newcomer_opens_two_files_at_most() -> None:
+    paths = newcomers_paths()
+    assert sorted(n for cell in paths for n in numbers_of(cell)) == list(range(1, 18)) and "Algorithm 1" in paths
+    assert all(1 <= len(files) <= 2 for files in paths.values())
+
+
+@pytest.mark.parametrize("cell", sorted(newcomers_paths()))
+def test_every_file_of_the_path_leads_on(cell: str) -> None:
+    """A file names the next by its path or imports it; the last one names the equation itself."""
+    files = newcomers_paths()[cell]
+    for here, there in pairwise(["slam.py", *files]):
+        text = (PACKAGE / here).read_text(encoding="utf-8")
+        assert there in text or there.removesuffix(".py").rpartition("/")[2] in text, f"{here} does not lead to {there}"
+    last = PACKAGE / files[-1]
+    if cell == "Algorithm 1":
+        assert "Algorithm 1" in last.read_text(encoding="utf-8")
+    else:
+        assert numbers_of(cell) <= equations_named(last)

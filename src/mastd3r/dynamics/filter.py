@@ -51,7 +51,8 @@ class LogOddsFilter:
         self._worker = Worker("depth")
 
     def prior(self, gray: Array, semantic: Array | None = None, features: Array | None = None) -> Array:
-        """P(moving) (h, w) float32 before the pose is known: the last posterior along the flow, semantics, appearance.
+        """P(moving) (h, w) float32 before the pose is known, the prior of (2): the last posterior along the flow,
+        semantics, appearance.
 
         ``features`` (h', w', c) are descriptors of any kind for the appearance classifier. Raises InputError for an
         image of another size.
@@ -66,7 +67,7 @@ class LogOddsFilter:
         return sigmoid(share * refinement.full(log_odds) + refinement.semantic_log_odds(semantic))
 
     def update(self, frame: DynamicsInput) -> DynamicMask:
-        """P(moving) once the frame's pose is known; the log-odds move on to this frame. Raises InputError."""
+        """P(moving) once the frame's pose is known, (2) in log-odds, which move on to this frame. Raises InputError."""
         check_input(frame, self.refinement.width, self.refinement.height)
         arrival = self._arrive(frame.gray, frame.features)
         fresh, carried, evidence = self._evidence(frame, arrival)

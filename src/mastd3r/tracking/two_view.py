@@ -60,7 +60,7 @@ class TwoViewEstimator:
         known = Guess(graph.camera(), inv_depth, info, guess if started else None)
 
         def matched(start: Array | None) -> tuple[PairPrediction, Array]:
-            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))  # (7)
+            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))  # (7): pointmap/geometric.py
             # (5)(6), softly: a match weighs as much as both its ends are static
             return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
