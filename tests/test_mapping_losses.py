@@ -9,7 +9,7 @@ from skimage.metrics import structural_similarity
 
 from mastd3r.dynamics.uncertainty import uncertainty_weight
 from mastd3r.mapping.losses import (
-    doubted,
+    discounted,
     mask_loss,
     photometric_loss,
     pixel_weight,
@@ -60,7 +60,7 @@ def test_17_total(kind: str, paper: bool) -> None:
     elif kind == "uncertainty":  # from 1 where nothing is uncertain to lambda where all is
         assert torch.allclose(total, w * (1 - 0.9 * u))
     else:
-        p = 1 - doubted(STATIC, u, 0.1)
+        p = 1 - discounted(STATIC, u, 0.1)
         assert torch.allclose(total[0, :3], (1 - 0.95 * p[0, :3]) * (p[0, :3] <= 0.8))
         assert float(total[0, 0]) == 1
     assert float(total[0, 3]) == 0
@@ -69,8 +69,8 @@ def test_17_total(kind: str, paper: bool) -> None:
 def test_doubt_is_bayes_rule_and_leaves_the_sure_alone() -> None:
     """The odds of moving grow by 1 / lambda where u is 1; what is surely static, or surely moving, stays so."""
     static = torch.tensor([[0.999, 0.7, 0.3, 0.0, 1.0]])
-    assert torch.allclose(doubted(static, torch.zeros(1, 5), 0.1), static)
-    after = doubted(static, torch.ones(1, 5), 0.1)
+    assert torch.allclose(discounted(static, torch.zeros(1, 5), 0.1), static)
+    after = discounted(static, torch.ones(1, 5), 0.1)
     odds = (1 - after[0, :3]) / after[0, :3] / ((1 - static[0, :3]) / static[0, :3])
     assert torch.allclose(odds, torch.tensor(10.0), rtol=1e-3)
     assert float(after[0, 0]) > 0.98 and float(after[0, 3]) == 0 and float(after[0, 4]) == pytest.approx(1)

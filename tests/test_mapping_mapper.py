@@ -198,7 +198,7 @@ def test_a_room_that_was_bent_by_5_cm_is_straight_again(truth: GaussianMap, monk
     distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
     after = distorted.quality(distorted.straight)
     distorted.mapper._map, distorted.mapper._view_parameters = trained_map, poses
-    monkeypatch.setattr("mastd3r.mapping.mapper.BEND_RATIO", np.inf)
+    monkeypatch.setattr("mastd3r.mapping.mapper.DEFORMATION_RATIO", np.inf)
     distorted.mapper.move_keyframes(distorted.drift, distorted.straight)
     by_anchors = distorted.quality(distorted.straight)
     assert after > before - 0.5 and after > by_anchors + 1

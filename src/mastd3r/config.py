@@ -68,7 +68,7 @@ class TrackingConfig:
     keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
     known_overlap_ratio: float = 0.8  # share of an older keyframe's points in view, above: it may be used again
     known_motion_ratio: float = 0.06  # median image motion from an older keyframe / width, below: the same
-    min_inlier_ratio: float = 0.35  # below: the pose is not believed
+    min_inlier_ratio: float = 0.35  # below: the pose is not accepted
 
 
 @dataclass(frozen=True)

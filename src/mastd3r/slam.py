@@ -139,7 +139,7 @@ class Slam:
             self.end_tracking()
         job.check_tracked()
         job.solve()  # joint optimisation: graph/bundle_adjustment.py; every frame's pose: offline/final_solve.py
-        material = job.smooth_masks(self.masks.filter.appearance)  # III-A, both ways: dynamics/smoother.py;
+        material = job.smooth_masks(self.masks.filter.appearance)  # III-A, forward-backward: dynamics/smoother.py;
         # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
         job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
         job.report()
@@ -204,7 +204,7 @@ class Slam:
             raise InputError(f"{what}: expected a run that goes on, got one that has been finished; make a new Slam")
 
     def _result(self, frame: Frame, moving: Future[Array]) -> TrackResult:
-        """What the caller is told; the pose is the map's as it is now."""
+        """What the caller gets; the pose is the map's as it is now."""
         state, record = self.state, self.graph.records[-1]
         placed = state.status is Status.TRACKING
         cam_from_world = record.cam_from_kf @ self.graph.variables[record.kf_id].cam_from_world if placed else None

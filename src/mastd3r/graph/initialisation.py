@@ -22,7 +22,7 @@ from .windows import ALL_INTRINSICS, Window
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
-MIN_AGREEMENT = 0.4  # of the matches, for a start to be believed
+MIN_AGREEMENT = 0.4  # of the matches, for a start to be accepted
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 SAME = 0.01  # starts whose focal lengths and costs differ by less came to the same end
 FITS_PX = 1.0  # a match further away counts as left out
@@ -115,7 +115,7 @@ def _starts(graph: KeyframeGraph) -> Iterator[_Start]:
 def _settle_on_most(graph: KeyframeGraph) -> float:
     """Solve on with the matches that fit alone, under bounds that tighten; what is left out, by weight.
 
-    Something that moves is not noise: its matches agree with one another, and a start that bends lens and poses
+    Something that moves is not noise: its matches agree with one another, and a start that distorts lens and poses
     until they nearly fit is cheap under a kernel that grows without end. A focal length far from what cameras have
     must explain more matches than one that is near.
     """
@@ -147,7 +147,7 @@ def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
     """Matches far from the start lose their weight; (p,) share that every keyframe's points keep, 1 without any."""
     errors = _errors_px(graph)
     used = np.concatenate([r[e.weight > USABLE_WEIGHT] for e, r in zip(graph.edges, errors, strict=True)])
-    bound_px = max(3.0, 5.0 * float(np.median(used)))  # a lens that is bent more than known moves the most
+    bound_px = max(3.0, 5.0 * float(np.median(used)))  # a lens that is distorted more than known moves the most
     kept = {k: np.zeros((2, len(v.px))) for k, v in graph.variables.items()}
     for e, r in zip(graph.edges, errors, strict=True):
         fits = r < bound_px

@@ -32,7 +32,7 @@ class Intrinsics:
 PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
 PRIOR_RADIAL_SIGMA = (0.05, 0.1, 0.1)  # of k, m, n
 PRIOR_CENTRE_SIGMA = 0.02  # of the principal point from the image's centre / width
-RADIAL, LATE = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what waits for lens_keyframes
+RADIAL, HELD_AT_FIRST = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what waits for lens_keyframes
 PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..geometry.reprojection_kernels import N_GLOBAL
 from .factors import ReprojectionFactor
-from .intrinsics import LATE, RADIAL, Intrinsics
+from .intrinsics import HELD_AT_FIRST, RADIAL, Intrinsics
 
 if TYPE_CHECKING:
     from .keyframe_graph import KeyframeGraph
@@ -61,5 +61,5 @@ def everything(graph: KeyframeGraph) -> Window:
 
 def _held(graph: KeyframeGraph, named: Iterable[int]) -> frozenset[int]:
     """Those named, and those that too few views cannot tell apart."""
-    late = LATE if len(graph.keyframes) < graph.config.lens_keyframes else ()
-    return frozenset(named) | frozenset(late)
+    held = HELD_AT_FIRST if len(graph.keyframes) < graph.config.lens_keyframes else ()
+    return frozenset(named) | frozenset(held)

@@ -1,4 +1,4 @@
-"""A graph correction that bends the world: a Gaussian follows all keyframes that see it, not its anchor alone.
+"""A graph correction that deforms the world: a Gaussian follows all keyframes that see it, not its anchor alone.
 
 Training has put a Gaussian where the views that see it agree best. Where those hang on keyframes that had drifted
 apart, that is between them; so its motion is theirs, averaged. What a view says is counted from the camera that it was
@@ -67,7 +67,7 @@ def visibility(
 
 
 def followed(gaussians: GaussianMap, changes: dict[int, Sim3], visibilities: Iterable[Visibility]) -> GaussianMap:
-    """The map after a correction, each Gaussian moved by the mean of what its sights say.
+    """The map after a correction, each Gaussian moved by the mean of what its views say.
 
     Its centre: least squares over the views, where a view counts by its pixels, and along its ray only by
     ``RAY_SHARE``, because it hardly tells depth. Its turn and its scale: the mean by pixels. What no view sees moves

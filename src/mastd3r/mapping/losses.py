@@ -65,7 +65,7 @@ def pixel_weight(
     """
     seen = (static > 0).to(static)
     if not paper and kind == "full" and u is not None:
-        static = seen * doubted(static, u, lambda_uncertainty)
+        static = seen * discounted(static, u, lambda_uncertainty)
     weight = static_weight(static, dynamic_weight, hard) if kind in ("mask", "full") else seen
     if not paper and kind in ("mask", "full"):
         return weight * (1 - static <= SURELY_MOVING)
@@ -76,7 +76,7 @@ def pixel_weight(
     return weight * (1 - (1 - lambda_uncertainty) * u)
 
 
-def doubted(static: torch.Tensor, u: torch.Tensor, lambda_uncertainty: float) -> torch.Tensor:
+def discounted(static: torch.Tensor, u: torch.Tensor, lambda_uncertainty: float) -> torch.Tensor:
     """P(static) after evidence u (0..1) against it: its odds times lambda^u."""
     against = static * lambda_uncertainty**u
     return against / (against + 1 - static).clamp_min(1e-12)

@@ -43,8 +43,8 @@ class TrainingRates:
 
 
 SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
-BEND_RATIO = 2e-3  # of the median depth, about half a pixel: corrections that bend less move Gaussians by their anchor
-MAX_SIGHTS = 48  # views that are drawn to see which keyframes a Gaussian follows
+DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaussians move by their anchor
+MAX_VISIBILITIES = 48  # views that are drawn to see which keyframes a Gaussian follows
 
 
 class Mapper:
@@ -146,7 +146,7 @@ class Mapper:
     def move_keyframes(self, old_world_from_kf: dict[int, Array], new_world_from_kf: dict[int, Array]) -> None:
         """Follow a graph correction: Gaussians and views move with their keyframes; nothing restarts.
 
-        Where the correction bends the world, a Gaussian goes with all keyframes that see it (``correction.py``),
+        Where the correction deforms the world, a Gaussian goes with all keyframes that see it (``correction.py``),
         which costs a picture of some views; otherwise with its anchor alone.
         """
         changes = changes_of(old_world_from_kf, new_world_from_kf)
@@ -155,7 +155,7 @@ class Mapper:
         hung = [changes.get(v.kf_id, Sim3.identity()) for v in self._views]
         middle = self._map.means.detach().double().median(0).values.cpu().numpy()
         before, views = self._map, self._view_parameters
-        if deformation(hung, middle) <= BEND_RATIO * self._depth:
+        if deformation(hung, middle) <= DEFORMATION_RATIO * self._depth:
             self._map = before.moved(changes)
             views.move_keyframes(changes)
             return
@@ -168,7 +168,7 @@ class Mapper:
 
     def _sights(self, changes: list[Sim3]) -> Iterator[tuple[int, Visibility]]:
         """What a part of the views sees of the map now; ``changes`` are those of all views' keyframes."""
-        for number in _evenly(range(len(self._views)), MAX_SIGHTS):
+        for number in _evenly(range(len(self._views)), MAX_VISIBILITIES):
             view, (_, weight) = self._views[number], self._target(number)
             K = torch.from_numpy(view.camera.matrix).to(self._device)
             pose = self._view_parameters.cam_from_world(number).detach()

@@ -80,10 +80,10 @@ def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
 
 def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:
     """The matches that a frame kept of its keyframe, with the keyframe's depths as they are now."""
-    block, keep = graph.variables[record.kf_id], record.points
+    v, keep = graph.variables[record.kf_id], record.points
     return StaticMatches(
-        block.px[keep],
-        block.inv_depth[keep],
+        v.px[keep],
+        v.inv_depth[keep],
         graph.depth_info(record.kf_id)[keep],
         record.target.astype(float),
         record.weight.astype(float),

@@ -138,7 +138,7 @@ class RunJob:
             seen = self._masks(map_view, appearance)
         with self.timed("poses under the masks"):
             if self.graph.started:
-                self._final = seen.late.poses(self.graph)
+                self._final = seen.reweighting.poses(self.graph)
                 self._write_trajectory()
                 seen = seen.with_poses(self._final)
         cloud = static_cloud(self.graph, seen.colors, seen.moving)

@@ -1,4 +1,4 @@
-"""What the masks of the second pass say of the matches that the poses of frames came from."""
+"""What the masks of the smoothing pass say of the matches that the poses of frames came from."""
 
 from __future__ import annotations
 

@@ -45,7 +45,9 @@ class SmoothedMasks:
     colors: dict[int, Array] = field(default_factory=dict)  # kf id -> (p, 3) uint8 at its px; no holdout frame
     moving: dict[int, Array] = field(default_factory=dict)  # kf id -> (p,) P(moving) at its px, by all frames
     holdout: list[FinalFrame] = field(default_factory=list)
-    late: MaskReweighting = field(default_factory=MaskReweighting)  # the masks, for the poses that they were made with
+    reweighting: MaskReweighting = field(
+        default_factory=MaskReweighting
+    )  # the masks, for the poses that they were made with
 
     def with_poses(self, final: list[FinalFrame]) -> SmoothedMasks:
         """The same seen from other poses."""
@@ -80,7 +82,7 @@ class SmoothingContext:
     config: Config
     map_view: MapView
     rectifier: Rectifier | None = None
-    appearance: Any = None  # what tracking learned of the looks of moving things
+    appearance: Any = None  # what tracking learned of the appearance of moving things
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def smooth_masks(
     with Worker("masks") as writer:
         for mask, waiting in smoother.masks(inputs):
             place = waiting.place
-            out.late.see(graph, place.record, mask.probability)
+            out.reweighting.see(graph, place.record, mask.probability)
             moving = _over_photograph(mask.probability, context.rectifier)
             shown = FrameMask(place.record.timestamp_s, waiting.small, mask, moving)
             written.append(writer.submit(partial(on_mask, shown)))
@@ -141,7 +143,7 @@ def smooth_masks(
 def _inputs(
     photographs: Iterator[Frame], context: SmoothingContext, chosen: set[int]
 ) -> Iterator[tuple[DynamicsInput, _Waiting]]:
-    """What the mask is told of each frame, and what is needed once the mask is there."""
+    """The mask's input of each frame, and what is needed once the mask is there."""
     by_index = {f.record.index: f for f in context.final}
     graph, parts, map_view, rectifier = context.graph, context.parts, context.map_view, context.rectifier
     observer, size = Observer(parts), parts.provider.size
@@ -195,12 +197,12 @@ def _seen_by(
 
     Outside counts as moving.
     """
-    block, camera = graph.variables[kf_id], graph.camera()
+    v, camera = graph.variables[kf_id], graph.camera()
     if place.record.is_keyframe and place.record.kf_id == kf_id:
-        px = block.px
+        px = v.px
     else:
         cam_from_kf = inverse(place.world_from_cam) @ graph.world_from_cam(kf_id)
-        points = transform(cam_from_kf, camera.unproject(block.px, np.maximum(block.inv_depth, 1e-9)))
+        points = transform(cam_from_kf, camera.unproject(v.px, np.maximum(v.inv_depth, 1e-9)))
         in_front = points[:, 2] > 0
         px = np.where(in_front[:, None], camera.project(np.where(in_front[:, None], points, 1.0)), -1e3)
     inside = (px > -0.5).all(1) & (px[:, 0] < camera.width - 0.5) & (px[:, 1] < camera.height - 0.5)

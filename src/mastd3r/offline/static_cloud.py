@@ -25,15 +25,15 @@ def static_cloud(graph: KeyframeGraph, colors: dict[int, Array], moving: dict[in
     camera = graph.camera()
     parts = []
     for k, color in colors.items():
-        block, kf = graph.variables[k], graph.keyframes[k]
+        v, kf = graph.variables[k], graph.keyframes[k]
         info = graph.depth_info(k)
-        own = depth_confidence(block.inv_depth, info)
-        inv_depth = inpainted(block.inv_depth, info, kf.work.grid)
+        own = depth_confidence(v.inv_depth, info)
+        inv_depth = inpainted(v.inv_depth, info, kf.work.grid)
         support = inpainted(np.maximum(own, 1e-3), np.full(len(own), 1e12), kf.work.grid)
         confidence = np.where(own > 0.5, own, 0.5 * support) * (1 - moving[k])
         keep = (confidence > 0.05) & (moving[k] < 0.5) & (inv_depth > 0.02 * np.median(inv_depth))
         depth = 1 / np.maximum(inv_depth, 1e-9)
-        points_cam = camera.rays(block.px) * depth[:, None]
+        points_cam = camera.rays(v.px) * depth[:, None]
         pose = graph.world_from_cam(k)
         cell = graph.size[0] / kf.work.grid[1]
         parts.append(

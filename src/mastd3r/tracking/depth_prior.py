@@ -39,14 +39,14 @@ def own_depth_spread(graph: KeyframeGraph) -> float | None:
     """
     found = []
     for kf in graph.keyframes:
-        block = graph.variables[kf.id]
-        if kf.work.own_inv_depth is None or len(block.depth_info) == 0:
+        v = graph.variables[kf.id]
+        if kf.work.own_inv_depth is None or len(v.depth_info) == 0:
             continue
-        own = sample_own(kf.work, block.px)
-        sure = (own > 0) & (block.inv_depth > 0) & (block.depth_info * block.inv_depth**2 > 1 / 0.05**2)
+        own = sample_own(kf.work, v.px)
+        sure = (own > 0) & (v.inv_depth > 0) & (v.depth_info * v.inv_depth**2 > 1 / 0.05**2)
         if sure.sum() >= 20:
-            ratio = np.log(own[sure] / block.inv_depth[sure])
-            leaning = 1 + block.prior_info[sure] / block.depth_info[sure]
+            ratio = np.log(own[sure] / v.inv_depth[sure])
+            leaning = 1 + v.prior_info[sure] / v.depth_info[sure]
             found.append(leaning * np.abs(ratio - np.median(ratio)))
     away = np.concatenate(found) if found else np.zeros(0)
     return 1.4826 * float(np.median(away)) if len(away) >= 200 else None
@@ -61,11 +61,11 @@ def predicted_depth(
     sigma_ratio: float | None,
 ) -> tuple[Array, Array]:
     """First inverse depths (p,) and information of a new keyframe: its own where measured, carried over otherwise."""
-    block = graph.variables[kf_id]
+    v = graph.variables[kf_id]
     if not graph.initialised:
         return np.ones(len(work.px)), np.full(len(work.px), 1e-2)
-    new_from_ref = cam_from_world @ inverse(block.cam_from_world)
-    value, _ = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px)
+    new_from_ref = cam_from_world @ inverse(v.cam_from_world)
+    value, _ = carried(v.px, v.inv_depth, graph.depth_info(kf_id), new_from_ref, graph.camera(), work.px)
     median = float(np.median(value))
     value = np.clip(value, 0.01 * median, 100 * median)
     info = np.full(len(value), 1e-3 / median**2)

@@ -37,14 +37,14 @@ LAST_MOTION = 0.3  # of the same: enough for the last frame of the video
 
 
 class Keyframes:
-    """Records frames, makes keyframes of some, and ties those to the map. Their edges may be made beside tracking."""
+    """Records frames, makes keyframes of some, and connects those to the map, perhaps beside tracking."""
 
     def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph, two_view: TwoViewEstimator) -> None:
         self.config, self.parts, self.graph, self.two_view = config, parts, graph, two_view
         self.edges = CovisibilityEdges(config.graph, parts)
         self._worker = Worker("edges")
         self._pending: Future[KeyframeGraph] | None = None  # the graph with the newest keyframe's edges, not yet taken
-        self._newest_at = 0  # records there were when the newest keyframe was tied
+        self._newest_at = 0  # records there were when the newest keyframe was connected
 
     # -- the stages of a frame -------------------------------------------------------------------------------
 
@@ -144,14 +144,14 @@ class Keyframes:
             self.edges.flows[before.id, kf.id] = view.pair.flow
         self.edges.add_one_way(graph, kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
         if graph.initialised:
-            self._tie(kf, before.id)
+            self._connect(kf, before.id)
         else:
             self.edges.add_recent(graph, kf, before.id)
             if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
                 self.edges.flows.clear()
         return replace(_at_keyframe(state, kf), status=status_in(graph))
 
-    def _tie(self, kf: Keyframe, before: int) -> None:
+    def _connect(self, kf: Keyframe, before: int) -> None:
         """Connect a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
         graph = self.graph
         everything = len(graph.members()) in SOLVED_AS_A_WHOLE

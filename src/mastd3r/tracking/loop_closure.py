@@ -1,4 +1,4 @@
-"""After the last frame: places seen again, by their looks where the map has drifted, by their poses elsewhere."""
+"""After the last frame: places seen again, by place recognition where the map has drifted, by their poses elsewhere."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_SIMILARITY = 0.55  # of two descriptors, for a pair to be looked at
 APART = 3  # keyframes between two of one place, below: they are neighbours
-MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be believed
+MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
 SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
 COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end

@@ -1,4 +1,4 @@
-"""What the mask of a frame is told of the graph: pose, expected depth and its 1-sigma."""
+"""The mask's input of one frame: pose, the depth that the graph expects there, and its 1-sigma."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ def dynamics_input(
     scale: float,
     features: Array | None = None,
 ) -> DynamicsInput:
-    """What the mask is told of a frame: pose, expected static depth with its 1-sigma, own depth, semantics, looks."""
-    block, camera = graph.variables[kf_id], graph.camera()
-    new_from_ref = inverse(world_from_cam) @ inverse(block.cam_from_world)
-    value, trusted = carried(block.px, block.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
-    sigma = 0.1 * value * np.sqrt(1 / np.maximum(trusted, 1e-4) - 1) + 0.02 * value
+    """The mask's input of a frame: pose, expected static depth with its 1-sigma, own depth, semantics, features."""
+    v, camera = graph.variables[kf_id], graph.camera()
+    new_from_ref = inverse(world_from_cam) @ inverse(v.cam_from_world)
+    value, confidence = carried(v.px, v.inv_depth, graph.depth_info(kf_id), new_from_ref, camera, work.px)
+    sigma = 0.1 * value * np.sqrt(1 / np.maximum(confidence, 1e-4) - 1) + 0.02 * value
     own = None if work.own_inv_depth is None else work.own_inv_depth / np.float32(scale)
     return DynamicsInput(
         work.index,
