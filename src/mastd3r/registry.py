@@ -104,7 +104,7 @@ PLACES = Registry("place recognition", "places", auto=True)
 MAP_BACKENDS = Registry("map backend", "mapping.backend", auto=True)
 REGISTRIES = (POINTMAPS, FEATURES, ALIGNMENT, DYNAMICS, SEMANTICS, PLACES, MAP_BACKENDS)
 
-POINTMAPS.register("geometric", "pointmap.geometric:build_geometric", "flow, triangulation, the lens from the video")
+POINTMAPS.register("geometric", "pointmap.geometric:build_geometric", "flow; depths and the lens from the video")
 POINTMAPS.register("mast3r", "parts:build_mast3r", "MASt3R, see `mastd3r weights`")
 POINTMAPS.register("depth", "pointmap.geometric:build_sensor_depth", "sensor depth of the sequence")
 
