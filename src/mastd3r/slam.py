@@ -84,6 +84,7 @@ class Slam:
         self.rectifier = rectifier_for(given, self.source.size)
         seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
         self.parts = parts if parts is not None else build_parts(self.config, seen)
+        self.map_device = chosen_map_device(self.config.mapping, self.parts.notes)
         self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen.size)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
         self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)
@@ -166,8 +167,7 @@ class Slam:
 
     def job(self, folder: RunFolder, reporter: Reporter | None = None) -> RunJob:
         """What writes this run into a folder."""
-        device = chosen_map_device(self.config.mapping, self.parts.notes)
-        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, device)
+        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, self.map_device)
         return RunJob(tracked, folder, reporter or Silent())
 
     def _finish_alone(self) -> Reconstruction:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..camera.pinhole import Camera
+from ..geometry.inpainting import inpainted_grid
 from ..geometry.se3 import transform
 
 Array = NDArray[Any]
@@ -25,13 +26,8 @@ def inpainted(inv_depth: Array, info: Array, grid: tuple[int, int]) -> Array:
     """(p,) inverse depths, those of low confidence inpainted from their neighbours (normalised convolution)."""
     confidence = depth_confidence(inv_depth, info).reshape(grid).astype(np.float32)
     depth = inv_depth.reshape(grid).astype(np.float32)
-    smooth = np.full(grid, np.float32(np.average(depth, weights=confidence + 1e-6)))
-    for sigma in (8.0, 4.0, 2.0, 1.0):
-        weight = cv2.GaussianBlur(confidence, (0, 0), sigma)
-        value = cv2.GaussianBlur(confidence * depth, (0, 0), sigma) / np.maximum(weight, 1e-9)
-        share = np.minimum(weight / 0.15, 1.0)
-        smooth = share * value + (1 - share) * smooth
-    return (confidence * depth + (1 - confidence) * smooth).astype(float).reshape(-1)
+    everywhere = float(np.average(depth, weights=confidence + 1e-6))
+    return inpainted_grid(depth, confidence, everywhere).astype(float).reshape(-1)
 
 
 def upsampled(values: Array, grid: tuple[int, int], width: int, height: int) -> Array:

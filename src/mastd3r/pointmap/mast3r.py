@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..errors import InputError
+from ..geometry.inpainting import inpainted_grid
 from ..types import Frame, Guess, Matches, PairPrediction, Pointmap, WorkFrame
 from .base import Provider
 from .geometric import GeometricPointmaps
@@ -240,7 +241,9 @@ class Mast3rPointmaps(Provider):
         neighbours', all of them the start's (or none) where nothing matched."""
         if not valid.any():
             return np.zeros((self.height, self.width, 2), np.float32) if fallback is None else fallback
-        cells = _smoothly_filled(moved.reshape(*grid, 2), valid.reshape(grid))
+        known = np.where(valid[:, None], moved, 0).reshape(*grid, 2).astype(np.float32)
+        everywhere = np.median(moved[valid], axis=0)
+        cells = inpainted_grid(known, valid.reshape(grid).astype(np.float32), everywhere)
         x = (np.arange(self.width) - offset[0] - FLOW_STEP_PX // 2) / FLOW_STEP_PX
         y = (np.arange(self.height) - offset[1] - FLOW_STEP_PX // 2) / FLOW_STEP_PX
         map_x, map_y = np.meshgrid(x.astype(np.float32), y.astype(np.float32))
@@ -315,15 +318,3 @@ def _flow_at(flow: Array, px: Array) -> Array:
     a, b = (at[:, 0] - x)[:, None], (at[:, 1] - y)[:, None]
     upper, lower = flow[y, x] * (1 - a) + flow[y, x + 1] * a, flow[y + 1, x] * (1 - a) + flow[y + 1, x + 1] * a
     return np.asarray(upper * (1 - b) + lower * b, float)
-
-
-def _smoothly_filled(values: Array, valid: Array) -> Array:
-    """(rows, cols, 2) float32: valid cells as they are, the others from valid neighbours, near ones first."""
-    weight = valid.astype(np.float32)
-    known = np.where(valid[..., None], values, 0).astype(np.float32)
-    out = np.broadcast_to(np.median(values[valid], axis=0), values.shape).astype(np.float32)
-    for sigma in (8.0, 4.0, 2.0, 1.0):
-        near = cv2.GaussianBlur(weight, (0, 0), sigma)[..., None]
-        share = np.minimum(near / 0.15, 1.0)
-        out = share * cv2.GaussianBlur(known, (0, 0), sigma) / np.maximum(near, 1e-9) + (1 - share) * out
-    return np.where(valid[..., None], known, out)
