@@ -160,6 +160,14 @@ def test_nothing_goes_on_after_the_end(clip: list[tuple[float, Array]]) -> None:
             call()
 
 
+def test_frames_without_a_source_cannot_be_read_again(room_clip: Path) -> None:
+    slam = mastd3r.Slam(NO_MAP, (160, 120))
+    for frame in list(open_source(room_clip, SourceConfig()).frames())[:3]:
+        slam.track(frame)
+    with pytest.raises(InputError, match="expected images, or a source"):
+        slam.finish()
+
+
 def test_sizes_and_names_that_are_none() -> None:
     with pytest.raises(InputError, match=r"size: expected \(width, height\)"):
         mastd3r.Slam(NO_MAP, (0, 120))

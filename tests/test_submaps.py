@@ -367,6 +367,7 @@ def test_a_jerk_starts_a_submap_which_is_joined_when_the_place_is_seen_again(jer
     run = play(jerk, motion_ratio=0.1)
     assert [s.index for s in run.steps if s.reason] == [0, 30]
     assert run.steps[30].reason.startswith("the view before it cannot be followed")
+    assert run.steps[29].submap == 0 and run.steps[30].submap == 1
     assert {f.state for f in run.final} <= {"started", "tracked"}
     assert set(run.slam.graph.submap_of.values()) == {0} and run.slam.graph.started == {0}
     every = np.ones(64, bool)

@@ -52,6 +52,7 @@ class TrackResult:
     is_keyframe: bool
     reason: str  # why the camera is lost or starts anew; empty while all goes well
     keyframe_id: int  # the keyframe that the frame hangs on
+    submap: int  # poses of different submaps have nothing in common until they are joined
     _moving: Future[Array]
     _as_given: Callable[[Array], Array]
 
@@ -111,7 +112,7 @@ class Slam:
         or does not rise, and after ``finish``.
         """
         frame = self._frame(image, timestamp_s, depth_m, semantic)
-        with self._timed(), one_blas_thread():
+        with self._measured():
             state = self.keyframes.up_to_date(self.state)
             seen = self.observer.observe(frame, None if state.anchor is None else state.anchor.work)  # (III-A)
             prior = self.masks.prior(seen)  # prior of (2): dynamics/filter.py
@@ -134,6 +135,8 @@ class Slam:
         Raises InputError where the frames had too little in them, and after an earlier ``finish``.
         """
         self._refuse_if_ended("finish")
+        if self.recorded is not None and self.recorded.length != self._tracked:
+            raise InputError("finish: expected images, or a source to read the frames from again, got frames alone")
         if job is None:
             return self._finish_alone()
         with job.timed("tracking"):
@@ -144,6 +147,8 @@ class Slam:
         # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
         job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
         job.report()
+        if self.recorded is not None:
+            self.recorded.close()
         return Reconstruction(job.folder.path)
 
     def end_tracking(self) -> None:
@@ -180,9 +185,11 @@ class Slam:
         return Reconstruction(job.folder.path, folder)
 
     @contextmanager
-    def _timed(self) -> Iterator[None]:
+    def _measured(self) -> Iterator[None]:
+        """Seconds and number of the frames that were tracked."""
         began = time.perf_counter()
-        yield
+        with one_blas_thread():
+            yield
         self._tracked, self._tracking_s = self._tracked + 1, self._tracking_s + time.perf_counter() - began
 
     def _near(self) -> Near:
@@ -222,6 +229,7 @@ class Slam:
             record.is_keyframe,
             state.reason,
             record.kf_id,
+            self.graph.submap,
             moving,
             as_given,
         )
