@@ -8,7 +8,7 @@ with its submodules, as for benchmarks/compare_reference.py. Weights are drawn o
 the released checkpoint; ``--small`` takes the tiny size, for a test of this file on a CPU.
 
 "Network alone" is what the loop asks for a frame: one encoding, and one decoding of a pair whose other frame is
-already encoded, with nothing else in between. ``loop`` is ``Slam.step`` over frames read from the files, with a network
+already encoded, with nothing else in between. ``loop`` is ``Slam.track`` over frames read from files, with a network
 that runs the same layers and answers with the truth (benchmarks/truth_network.py), so that frames really track.
 The file is written after every part; a part that fails is recorded in one line, and the next one runs.
 """

@@ -160,7 +160,7 @@ def _random_dinov2(folder: Path, small: bool) -> None:
 
 
 def loop(b: Any) -> dict[str, Any]:
-    """``Slam.step`` over the sequence, against the network alone in the same setting; where the time goes."""
+    """``Slam.track`` over the sequence, against the network alone in the same setting; where the time goes."""
     import bench_networks as bench
 
     clip = _clip(b)

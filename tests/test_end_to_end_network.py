@@ -103,7 +103,7 @@ def test_a_network_that_knows_the_truth(room_clip: Path, tmp_path: Path, monkeyp
     assert any("MASt3R" in note and "working image 160x120" in note for note in record["choices"])
     spread = next(note for note in record["choices"] if "own depths differ" in note)
     assert float(spread.split("by ")[1].split("%")[0]) < 1.0 and "assumed 8.0%" in spread  # it knows the truth
-    # first pass: one decode a frame, two more where keyframes are matched; second pass: one a frame
+    # tracking: one decode a frame, two more where keyframes are matched; smoothing pass: one a frame
     assert network.decoded < 2.5 * 24
 
 

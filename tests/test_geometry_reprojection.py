@@ -31,7 +31,7 @@ seeds = st.integers(0, 10**6)
 
 
 class Edges:
-    """Random edges of one host: pixels, depths, targets a few pixels from their predictions, a lens of three terms.
+    """Random edges of one anchor: pixels, depths, targets a few pixels from their predictions, a lens of three terms.
 
     Drawn again where a point falls behind a camera or beyond the fold of the lens: nothing has a derivative there.
     """

@@ -58,9 +58,8 @@ class Source(Protocol):
     notes: list[str]  # choices and warnings, for the log and run.json
     has_depth: bool  # frames() can carry depth_m
     has_semantic: bool  # frames() can carry semantic
-    calibration: tuple[
-        float, ...
-    ]  # what the dataset says of its lens, as --intrinsics; empty: nothing. See reconstruct.py
+    # what the dataset says of its lens, as --intrinsics; empty: nothing. Read by pipeline.py alone
+    calibration: tuple[float, ...]
 
     def frames(self) -> Iterator[Frame]: ...
     def truth(self) -> Truth | None: ...
