@@ -10,7 +10,8 @@ import pytest
 
 import mastd3r
 from mastd3r.alignment.align import CoarseToFine
-from mastd3r.cli.parser import config_from_args, parser
+from mastd3r.cli.options import config_from_args
+from mastd3r.cli.parser import parser
 from mastd3r.config import Config, with_override
 from mastd3r.dynamics.ours import LogOddsModel
 from mastd3r.errors import ConfigError

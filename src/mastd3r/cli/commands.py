@@ -17,6 +17,7 @@ from rich.table import Table
 
 from ..config import Config, config_from_dict, config_to_yaml
 from ..errors import ConfigError
+from .options import config_from_args
 
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
@@ -24,8 +25,6 @@ DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on tw
 
 def run(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r run``."""
-    from .parser import config_from_args
-
     if args.end_with_stdin:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)

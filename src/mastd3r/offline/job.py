@@ -159,7 +159,14 @@ class RunJob:
             )
         self.metrics |= trained.metrics
         write_renders_and_flight(
-            trained.mapper, self.folder, material.seen, material.map_view, self._final, self.tracked.lens(), self
+            trained.mapper,
+            self.folder,
+            material.seen,
+            material.map_view,
+            self._final,
+            self.tracked.lens(),
+            self.timed,
+            self.reporter,
         )
 
     def report(self) -> None:

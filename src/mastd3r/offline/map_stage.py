@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +25,7 @@ from .final_solve import FinalFrame
 from .renders import depth_png_per_unit, flight_camera, flight_path, write_flight
 from .smoothing import SmoothedMasks
 
-if TYPE_CHECKING:
-    from .job import RunJob
-
+Timed = Callable[[str], AbstractContextManager[None]]  # adds what a block takes to a stage's seconds
 MAPPED_SAMPLES = 24  # training views that psnr_mapped is the mean over
 
 
@@ -73,11 +73,12 @@ def write_renders_and_flight(
     map_view: MapView,
     final: list[FinalFrame],
     lens: Camera | OpenCvLens,
-    job: RunJob,
+    timed: Timed,
+    reporter: Reporter,
 ) -> None:
     """renders/ and depth/ of the holdout frames; flight.mp4 along the smoothed trajectory, at neutral exposure."""
     per_unit = depth_png_per_unit(mapper.facts["median_depth"])
-    with job.timed("renders"), job.reporter.stage("renders", len(seen.holdout), "frames") as bar:
+    with timed("renders"), reporter.stage("renders", len(seen.holdout), "frames") as bar:
         for place in seen.holdout:
             if not np.isfinite(place.world_from_cam).all():
                 continue
@@ -88,5 +89,5 @@ def write_renders_and_flight(
             bar.advance()
     times_s = np.array([f.record.timestamp_s for f in final])
     poses = flight_path(times_s, np.stack([f.world_from_cam for f in final]))
-    with job.timed("flight"), job.reporter.stage("flight", len(poses), "frames") as bar:
+    with timed("flight"), reporter.stage("flight", len(poses), "frames") as bar:
         write_flight(folder.path / "flight.mp4", mapper.render, flight_camera(lens), poses, bar.advance)

@@ -1,0 +1,49 @@
+"""The options of ``run`` as a configuration."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+
+from ..config import Config, config_from_yaml, preset, with_override
+from ..errors import ConfigError
+
+
+def config_from_args(args: argparse.Namespace) -> Config:
+    """Defaults, then the preset, the file, --set, and the named options."""
+    config = preset(args.preset) if args.preset else Config()
+    if args.config:
+        config = config_from_yaml(args.config, config)
+    for item in args.set:
+        config = with_override(config, item)
+    for name in ("pointmaps", "semantics", "correction", "seed"):
+        if getattr(args, name) is not None:
+            config = replace(config, **{name: getattr(args, name)})
+    window = {k: getattr(args, k) for k in ("start", "end", "stride", "kind") if getattr(args, k) is not None}
+    config = replace(config, source=replace(config.source, **window))
+    if args.map_loss is not None:
+        config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
+    if args.realtime and args.no_map:
+        raise ConfigError("--realtime: expected a map to be made, got --no-map")
+    if args.realtime:
+        config = replace(config, mapping=replace(config.mapping, realtime=True))
+    if args.no_map:
+        config = replace(config, mapping=replace(config.mapping, enabled=False))
+    if args.maps is not None and config.semantics == "auto":
+        config = replace(config, semantics="maps")
+    if args.intrinsics == "dataset":
+        config = replace(config, camera=replace(config.camera, intrinsics=(), from_dataset=True))
+    elif args.intrinsics is not None:
+        given = _numbers(args.intrinsics)
+        config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
+    return config
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(x) for x in text.replace(",", " ").split())
+    except ValueError as e:
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got {text!r}") from e
+    if not numbers:
+        raise ConfigError("--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got nothing")
+    return numbers
