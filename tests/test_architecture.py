@@ -78,8 +78,8 @@ HEAVY = {  # package: who may import it
 # recordings are CUDA's; config: mapping.device; gsplat's backend
 NAMES_A_DEVICE = {"mapping.rasterise", "mapping.rasterise_gsplat", "networks.record", "config"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
-PASSES_TRUTH_ON = {"offline.job", "cli.commands"}
-TRUTH_GOES_TO = {"evaluate", "evaluate_trajectory"}
+PASSES_TRUTH_ON = {"offline.job", "offline.reconstruction", "pipeline"}
+TRUTH_GOES_TO = {"evaluate", "score"}
 EXITS = {"cli.main", "__main__"}
 
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from .config import Config
     from .errors import ConfigError, InputError, MissingPackage, OutputError, SlamError
     from .offline.reconstruction import Reconstruction
-    from .pipeline import load, reconstruct
+    from .pipeline import evaluate_trajectory, load, reconstruct
     from .slam import Slam, TrackResult
     from .tracking.state import Status
 
@@ -33,6 +33,7 @@ __all__ = [
     "Status",
     "TrackResult",
     "__version__",
+    "evaluate_trajectory",
     "load",
     "reconstruct",
 ]
@@ -47,6 +48,7 @@ _HOME = {
     "SlamError": "errors",
     "Status": "tracking.state",
     "TrackResult": "slam",
+    "evaluate_trajectory": "pipeline",
     "load": "pipeline",
     "reconstruct": "pipeline",
 }

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from .concurrency import one_blas_thread
 from .config import Config
 from .errors import InputError
+from .evaluation.evaluate import evaluate_trajectory as score
 from .export.run_folder import RunFolder
+from .export.trajectory_files import read_trajectory
 from .offline.job import MapMaterial, RunJob
 from .offline.reconstruction import Reconstruction
 from .parts import with_dataset_lens
@@ -59,6 +61,16 @@ def reconstruct(
         _track(slam, job)
         slam.finish(job)
     return Reconstruction(folder.path, temporary)
+
+
+def evaluate_trajectory(path: str | Path, kind: str, sequence: str | Path) -> dict[str, Any]:
+    """Another system's poses, scored as our own are; rows that have no time are the frames' in order.
+
+    kind: tum, kitti or euroc. Raises InputError for a file or a sequence that cannot be read, or without truth.
+    """
+    source = open_source(sequence, Config().source)
+    times_s = np.array([f.timestamp_s for f in source.frames()])
+    return score(read_trajectory(Path(path), kind, times_s), source.truth(), times_s).metrics
 
 
 @one_blas_thread()

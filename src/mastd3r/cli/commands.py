@@ -15,7 +15,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from ..config import Config, config_from_dict, config_to_yaml
+from ..config import Config, config_to_yaml
 from ..errors import ConfigError
 from .options import config_from_args
 
@@ -88,47 +88,23 @@ def demo(args: argparse.Namespace, console: Console) -> int:
 
 def evaluate_run(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r eval``."""
-    import yaml
-
-    from ..evaluation.evaluate import evaluate
     from ..export.files import write_json
-    from ..export.read_run import read_run
-    from ..sources import open_source
+    from ..pipeline import evaluate_trajectory, load
 
-    if args.trajectory is not None:
-        return _eval_trajectory(args)
-    if len(args.paths) != 2 or args.format or args.out:
-        got = "--format or --out without it" if args.format or args.out else f"{len(args.paths)} path(s)"
-        raise ConfigError(f"eval: expected RUN SEQUENCE, or --trajectory FILE --format KIND SEQUENCE, got {got}")
-    run, sequence = args.paths
-    recorded = read_run(run)
-    config = config_from_dict(yaml.safe_load(recorded.config) or {}) if recorded.config else Config()
-    source = open_source(sequence, config.source)
-    found = evaluate(run, source.truth(), source.frames()).metrics
-    metrics = {**recorded.metrics, **found}
-    write_json(run / "metrics.json", metrics)
-    Console().print(_table(metrics))
-    return 0
-
-
-def _eval_trajectory(args: argparse.Namespace) -> int:
-    """Another system's poses, scored as our own are; rows that have no time are the frames' in order."""
-    import numpy as np
-
-    from ..evaluation.evaluate import evaluate_trajectory
-    from ..export.files import write_json
-    from ..export.trajectory_files import read_trajectory
-    from ..sources import open_source
-
+    if args.trajectory is None:
+        if len(args.paths) != 2 or args.format or args.out:
+            got = "--format or --out without it" if args.format or args.out else f"{len(args.paths)} path(s)"
+            raise ConfigError(f"eval: expected RUN SEQUENCE, or --trajectory FILE --format KIND SEQUENCE, got {got}")
+        run, sequence = args.paths
+        Console().print(_table(load(run).evaluate(sequence)))
+        return 0
     if len(args.paths) != 1 or args.format is None:
         got = f"{len(args.paths)} paths and --format {args.format}"
         raise ConfigError(f"eval --trajectory: expected --format tum, kitti or euroc and one SEQUENCE, got {got}")
-    source = open_source(args.paths[0], Config().source)
-    times_s = np.array([f.timestamp_s for f in source.frames()])
-    found = evaluate_trajectory(read_trajectory(args.trajectory, args.format, times_s), source.truth(), times_s)
-    Console().print(_table(found.metrics))
+    metrics = evaluate_trajectory(args.trajectory, args.format, args.paths[0])
+    Console().print(_table(metrics))
     if args.out is not None:
-        write_json(args.out, found.metrics)
+        write_json(args.out, metrics)
     return 0
 
 
@@ -145,9 +121,9 @@ def view(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r view``."""
     import webbrowser
 
-    from ..export.read_run import read_run
+    from ..pipeline import load
 
-    report = read_run(args.run).path / "report.html"
+    report = load(args.run).path / "report.html"
     if not report.is_file():
         raise ConfigError(f"{report}: expected the report of a complete run, got none")
     Console().print(f"opening {report}")

@@ -46,7 +46,7 @@ def read_tum(path: Path, state: State = "tracked") -> Trajectory:
     return _in_order(data[:, 0], data[:, 1:4], rotation_from_quaternion(data[:, [7, 4, 5, 6]]), state)
 
 
-def read_trajectory(path: Path, kind: TrajectoryKind, times_s: Array) -> Trajectory:
+def read_trajectory(path: Path, kind: str, times_s: Array) -> Trajectory:
     """Another system's trajectory: poses of the camera in the world (world_from_cam), OpenCV axes.
 
     tum: eight numbers a row. kitti: twelve, the top of world_from_cam; row n belongs to frame n, whose time is

@@ -10,17 +10,22 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
+from ..config import Config, config_from_dict
+from ..errors import ConfigError
+from ..evaluation.evaluate import evaluate
 from ..export.claim import claim
-from ..export.files import writing
+from ..export.files import write_json, writing
 from ..export.formats import export_run
 from ..export.point_cloud import read_cloud
 from ..export.read_run import Run, read_run
 from ..mapping.gaussians import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
+from ..sources import open_source
 from ..types import StaticCloud
 from .renders import export_splat, lens_of
 
@@ -131,6 +136,26 @@ class Reconstruction:
         """Why the run is not complete."""
         reason: str | None = self._run.record.get("reason")
         return reason
+
+    @property
+    def config(self) -> Config:
+        """The options that it was made with. Raises ConfigError for a config.yaml that nobody can read."""
+        try:
+            data = yaml.safe_load(self._run.config) or {}
+        except yaml.YAMLError as e:
+            raise ConfigError(f"{self.path}/config.yaml: expected readable YAML, got {' '.join(str(e).split())}") from e
+        return config_from_dict(data)
+
+    def evaluate(self, sequence: str | Path) -> dict[str, Any]:
+        """Figures against a sequence with truth, as metrics.json says them from here on; as ``mastd3r eval``.
+
+        Raises InputError for a sequence that cannot be read or is another one, OutputError.
+        """
+        source = open_source(sequence, self.config.source)
+        metrics = {**self.metrics, **evaluate(self.path, source.truth(), source.frames()).metrics}
+        write_json(self.path / "metrics.json", metrics)
+        self._run = read_run(self.path)
+        return metrics
 
     def save(self, path: str | Path) -> Path:
         """Copy the run folder to ``path``, and stay there. Raises OutputError where that is not ours to write."""
