@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import inverse, so3_exp, transform
 from mastd3r.sources import synthetic
+from mastd3r.sources.room import Room
 from mastd3r.types import Matches, WorkFrame
 
 Array = NDArray[Any]
@@ -26,6 +28,14 @@ def no_weights(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """What ``auto`` chooses must not depend on what this machine's user has downloaded."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MASTD3R_HOME", str(tmp_path_factory.mktemp("home")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_room_a_seed() -> Iterator[None]:
+    """Its textures take longer to draw than a dozen frames of it, and nothing changes them: each room is made once."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "Room", cache(Room))
         yield
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any
 
 import cv2
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from mastd3r.camera.pinhole import Camera
 from mastd3r.geometry.se3 import inverse, transform
+from mastd3r.sources import synthetic
 from mastd3r.sources.room import RayGrid, Room, camera_pose
 from mastd3r.sources.synthetic import room_camera
 
@@ -39,9 +39,8 @@ class RoomView:
     points_world: Array  # (h, w, 3) float64
 
 
-@cache
 def room() -> Room:
-    return Room(0)
+    return synthetic.Room(0)  # made once: see conftest.py
 
 
 def look(time_s: float, camera: Camera | None = None) -> RoomView:

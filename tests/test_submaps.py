@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -291,12 +293,20 @@ class Played:
         return float(np.linalg.norm(np.diff(self.truth[:, :3, 3], axis=0), axis=1).sum())
 
 
+@cache
+def _walk(pose: Callable[[float], Array]) -> tuple[Iterator[SyntheticView], list[SyntheticView]]:
+    """Frames still to be made, and those made so far."""
+    return synthetic.synthetic_frames(1000, *Room.size), []
+
+
 def views_of(count: int, pose: Callable[[float], Array] = camera_pose) -> list[SyntheticView]:
-    """Frames of the room at 10 a second: enough way for a dozen keyframes."""
+    """Frames of the room at 10 a second: enough way for a dozen keyframes. Made once for all tests; read only."""
+    to_come, made = _walk(pose)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CLIP_FPS", 10.0)
         patch.setattr(synthetic, "camera_pose", pose)
-        return list(synthetic.synthetic_frames(count, *Room.size))
+        made += islice(to_come, max(0, count - len(made)))
+    return made[:count]
 
 
 @pytest.fixture(scope="module")
