@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # networks are tiny here: torch's threads would spin more than they work
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import inverse, so3_exp, transform
+from mastd3r.offline import renders
 from mastd3r.sources import synthetic
 from mastd3r.sources.room import Room
 from mastd3r.types import Matches, WorkFrame
@@ -37,6 +39,12 @@ def one_room_a_seed() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "Room", cache(Room))
         yield
+
+
+@pytest.fixture
+def short_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run's flight takes a second, not five: how long it should be has a test of its own."""
+    monkeypatch.setattr(renders, "FLIGHT_S", (1.0, 1.0))
 
 
 @pytest.fixture(scope="session")

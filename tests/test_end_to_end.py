@@ -105,6 +105,7 @@ def test_a_real_video(tmp_path: Path) -> None:
     assert "ate_rmse_all" not in metrics
 
 
+@pytest.mark.usefixtures("short_flight")
 def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     changed = (

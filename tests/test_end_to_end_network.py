@@ -107,6 +107,7 @@ def test_a_network_that_knows_the_truth(room_clip: Path, tmp_path: Path, monkeyp
     assert network.decoded < 2.5 * 24
 
 
+@pytest.mark.usefixtures("short_flight")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_tiny_random_network(room_clip: Path, tmp_path: Path, seed: int) -> None:
     """Nonsense points: the run completes, every frame has a finite pose and a state, and it is said what was lost."""

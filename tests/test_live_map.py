@@ -115,6 +115,7 @@ def test_a_process_that_died_gives_no_map_and_no_hang() -> None:
     assert time.perf_counter() - began < 10
 
 
+@pytest.mark.usefixtures("short_flight")
 def test_a_run_that_maps_while_it_tracks(room_clip: Path, tmp_path: Path) -> None:
     """Everything that a run leaves is there, the process was fed, and the splat is as good as after two passes."""
     out = tmp_path / "out"

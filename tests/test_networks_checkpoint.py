@@ -24,9 +24,14 @@ State = dict[str, torch.Tensor]
 NORM, FC = "enc_norm.weight", "enc_blocks.0.mlp.fc1.weight"
 
 
+@pytest.fixture(scope="module")
+def whole() -> State:
+    return random_mast3r(SMALL, seed=5).state_dict()
+
+
 @pytest.fixture
-def state() -> State:
-    return {name: value.clone() for name, value in random_mast3r(SMALL, seed=5).state_dict().items()}
+def state(whole: State) -> State:
+    return {name: value.clone() for name, value in whole.items()}
 
 
 def saved(path: Path, state: dict[str, Any], **args: Any) -> Path:

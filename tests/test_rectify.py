@@ -349,6 +349,7 @@ def test_masks_come_back_in_pixels_of_the_photograph(track: Callable[..., Path])
         assert np.abs(centroid(mask[..., None], wanted, 7) - wanted).max() < 0.1
 
 
+@pytest.mark.usefixtures("short_flight")
 def test_renders_are_photographs_of_the_bent_lens(track: Callable[..., Path], clips: dict[str, Path]) -> None:
     words = ["mapping.iterations=150", "mapping.width_px=120", "tracking.cell_px=5"]
     run = track("bent", ROOM, *(w for word in words for w in ("--set", word)))
