@@ -20,7 +20,7 @@ from mastd3r.graph.depth import carried, depth_confidence, inpainted, upsampled
 from mastd3r.graph.initialisation import bootstrap
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.place_recognition import PlaceRecognition
+from mastd3r.graph.place_recognition import PlaceRecognition, build_thumbnail
 from mastd3r.graph.prediction import rigid_flow
 from mastd3r.sources.synthetic import SyntheticView
 from mastd3r.types import Matches
@@ -346,7 +346,7 @@ def test_places_know_a_picture_again(exact_scene: Callable[..., Any], room_views
     for k, gray in enumerate(grays):
         work = replace(scene.work_frame(k), gray=np.ascontiguousarray(gray))
         graph.add_keyframe(work, np.ones(p), np.zeros(gray.shape), np.eye(4), np.ones(p), np.ones(p))
-    index = PlaceRecognition()
+    index = PlaceRecognition(build_thumbnail(None))
     first, third = (graph.keyframes[k].work for k in (0, 2))
     like_first = replace(first, gray=np.clip(grays[0].astype(int) + 20, 0, 255).astype(np.uint8))  # brighter
     assert index.best(graph, like_first, [0, 1, 2])[0].id == 0
@@ -364,7 +364,7 @@ def test_places_are_of_the_keyframes_there_are_now(
     graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), 160, 120, (160, 120)))
     gray = room_views[0].frame.image[..., 1]
     p = len(scene.px)
-    index = PlaceRecognition()
+    index = PlaceRecognition(build_thumbnail(None))
     for n, images in enumerate(([gray, 255 - gray], [255 - gray, gray])):
         for k, image in enumerate(images):
             work = replace(scene.work_frame(2 * n + k), gray=np.ascontiguousarray(image))
