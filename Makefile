@@ -29,7 +29,7 @@ demo: setup
 	$(BIN)/mastd3r demo --out runs/demo
 
 test: lint
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile
 
 lint: setup
 	$(BIN)/ruff check .

@@ -24,7 +24,7 @@ from mastd3r.errors import ConfigError
 from mastd3r.export.report import ReportData, report_html
 from mastd3r.registry import DYNAMICS
 from mastd3r.sources import open_source, synthetic
-from mastd3r.sources.rectified import RectifiedSource
+from mastd3r.sources.rectified import RectifiedSource, rectified
 from mastd3r.types import Frame, Trajectory
 
 Array = NDArray[Any]
@@ -157,7 +157,9 @@ def test_smaller_pictures_go_back_at_their_scale() -> None:
 def test_depth_is_never_mixed_and_maps_keep_their_scale() -> None:
     r, (_, size) = rectifier("cushion"), LENSES["cushion"]
     depth = np.where(np.indices(size[::-1])[1] % 14 < 7, 1.0, 3.0).astype(np.float32)
-    frame = r.frame(Frame(3, 0.5, np.zeros((*size[::-1], 3), np.uint8), depth, np.full((120, 160), 0.25, np.float32)))
+    photograph = Frame(3, 0.5, np.zeros((*size[::-1], 3), np.uint8), depth, np.full((120, 160), 0.25, np.float32))
+    frame = rectified(photograph, r)
+    assert frame.as_taken is photograph
     assert frame.depth_m is not None and frame.semantic is not None and (frame.index, frame.timestamp_s) == (3, 0.5)
     assert set(np.unique(frame.depth_m)) == {1.0, 3.0} and frame.depth_m.shape == frame.image.shape[:2] == r.size[::-1]
     assert np.abs(np.array(frame.semantic.shape) - np.array(r.size[::-1]) / 2).max() <= 1
