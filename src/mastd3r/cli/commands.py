@@ -55,7 +55,7 @@ def _run_and_show(
     reporter = Silent() if quiet else Terminal(console)
     result = reconstruct(source, out, config, maps=maps, command=words, reporter=reporter)
     Console().print(_table(result.metrics))
-    Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]")
+    Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]", soft_wrap=True)
     return 0
 
 
@@ -113,7 +113,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
     from ..pipeline import load
 
     written = load(args.run).export(args.to, args.out)
-    Console().print(f"wrote {written}")
+    Console().print(f"wrote {written}", soft_wrap=True)
     return 0
 
 
@@ -126,7 +126,7 @@ def view(args: argparse.Namespace, console: Console) -> int:
     report = load(args.run).path / "report.html"
     if not report.is_file():
         raise ConfigError(f"{report}: expected the report of a complete run, got none")
-    Console().print(f"opening {report}")
+    Console().print(f"opening {report}", soft_wrap=True)
     webbrowser.open(report.resolve().as_uri())
     return 0
 
