@@ -68,6 +68,7 @@ def test_a_live_loop_beside_another_is_the_run_of_the_command_line(
     assert results[-1].moving.shape == (height, width) and results[-1].moving.dtype == np.float32
     assert results[-1].moving.min() >= 0 and results[-1].moving.max() <= 1
     rec = first.finish()
+    assert rec.metrics["fps_total"] < rec.metrics["fps_tracking"]  # tracking is a part of the whole
     assert poses_file(rec) == poses_file(whole)
     for name in ("cloud.ply", "keyframes.txt", "camera.json"):
         assert (rec.path / name).read_bytes() == (whole.path / name).read_bytes()

@@ -179,7 +179,7 @@ class Slam:
         """``finish`` in a temporary folder."""
         folder = tempfile.TemporaryDirectory(prefix="mastd3r-run-", ignore_cleanup_errors=True)
         job = self.job(RunFolder(Path(folder.name)))
-        job.frames, job.timings["tracking"] = self._tracked, self._tracking_s
+        job.already_tracked(self._tracked, self._tracking_s)
         with job:
             self.finish(job)
         return Reconstruction(job.folder.path, folder)

@@ -99,6 +99,11 @@ class RunJob:
             self._live.after(self.frames, frame, self.graph, self.tracked.lens)
         self.frames += 1
 
+    def already_tracked(self, frames: int, seconds: float) -> None:
+        """So many frames were tracked, in so long, before this job began: they count as its own."""
+        self.frames, self.timings["tracking"] = frames, seconds
+        self._began -= seconds
+
     def check_tracked(self) -> None:
         """Raise InputError for a source that had too little in it."""
         self.folder.note(*self.source.notes)
