@@ -29,7 +29,7 @@ COUNT = 2000
 # Gaussians for the 0.3 px² that are added to them; no splat trained without that looks the same there.
 LEAST_DB = {("spark", "matched"): 38.0, ("spark", "default"): 35.0, ("gaussian-splats-3d", "default"): 41.0}
 TURNED_DB = 20.0  # less than this where the picture is mirrored or upside down
-TURNS = {"upside down": np.s_[::-1], "mirrored": np.s_[:, ::-1], "both": np.s_[::-1, ::-1]}
+TURNS: dict[str, Any] = {"upside down": np.s_[::-1], "mirrored": np.s_[:, ::-1], "both": np.s_[::-1, ::-1]}
 
 
 def lopsided_splat() -> GaussianArrays:

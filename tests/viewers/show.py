@@ -105,7 +105,7 @@ def viewer_modules() -> Path:
         except subprocess.TimeoutExpired as e:
             raise Missing(f"npm install took more than {INSTALL_S} s") from e
         if done.returncode:
-            raise Missing(f"npm install: {' '.join(done.stderr.split())[-300:]}")
+            raise Missing(f"npm install: {' '.join(done.stderr.replace('npm error', '').split())[:200]}")
         if not folder.is_dir():
             half.rename(folder)
     return folder / "node_modules"
