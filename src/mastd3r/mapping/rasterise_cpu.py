@@ -8,9 +8,10 @@ import numpy as np
 import torch
 
 from ..concurrency import in_blocks
-from .rasterise_cpu_blend import CHANNELS, TILE
-from .rasterise_cpu_project import GRADS, project_backward, project_forward, view_parameters
-from .rasterise_cpu_tiles import bin_tiles, depth_order, tiles_backward, tiles_forward
+from .rasterise_cpu_bin import GROUP, GROUP_PIXELS, bin_groups, depth_order
+from .rasterise_cpu_blend import ROW, SUMS
+from .rasterise_cpu_project import project_backward, project_forward, view_parameters
+from .rasterise_cpu_tiles import tiles_backward, tiles_forward
 from .screen import ScreenStats
 
 _CHUNKS = 64  # fixed, so that sums do not depend on the number of threads
@@ -31,47 +32,40 @@ class _Rasterise(torch.autograd.Function):
         near: float,
         eps2d: float,
         stats: ScreenStats | None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        inputs = [np.ascontiguousarray(t.detach().numpy()) for t in (means, quats, scales, opacities)]
-        count, (width, height) = len(inputs[0]), size
-        columns, rows = -(-width // TILE), -(-height // TILE)
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        inputs = tuple(np.ascontiguousarray(t.detach().numpy()) for t in (means, quats, scales, opacities))
+        count, (width, height) = len(means), size
+        columns, lines = -(-width // GROUP_PIXELS), -(-height // GROUP_PIXELS)
         view_array, lens = view_parameters(view.detach().numpy(), intrinsics, width, height)
-        centre, conic = np.zeros((count, 2), np.float32), np.zeros((count, 3), np.float32)
+        rows = np.empty((count, ROW), np.float32)
         depth, radius = np.empty(count, np.float32), np.empty((count, 2), np.int32)
-        projected = centre, conic, depth, radius
-        in_blocks(project_forward, count, *inputs, view_array, lens, near, eps2d, *projected)
-        pairs = bin_tiles(depth_order(depth, radius), centre, radius, columns, rows)
-        features = np.empty((count, CHANNELS), np.float32)
-        features[:, :3], features[:, 3] = colors.detach().numpy(), depth
-        image = np.empty((height, width, CHANNELS), np.float32)
-        transmittance, stop = np.empty((height, width), np.float32), np.empty(columns * rows, np.int64)
-        tile_input = (*pairs[:2], centre, conic, inputs[3], features)
-        in_blocks(tiles_forward, rows * columns, width, height, columns, *tile_input, image, transmittance, stop)
-        ctx.state = inputs, view_array, lens, radius, pairs, tile_input, image, transmittance, stop, columns
-        ctx.stats = stats
+        projected = np.ascontiguousarray(colors.detach().numpy()), view_array, lens, near, eps2d, rows, depth, radius
+        in_blocks(project_forward, count, *inputs, *projected)
+        groups = bin_groups(depth_order(depth, radius), rows, radius, columns, lines)
+        images = tuple(np.empty((height, width, *channels), np.float32) for channels in ((3,), (), ()))
+        used = np.empty((columns * lines, GROUP * GROUP), np.int64)
+        in_blocks(tiles_forward, columns * lines, width, height, *groups, rows, *images, used)
+        ctx.state, ctx.stats = (inputs, view_array, lens, groups, rows, images, used), stats
         if stats is not None:
             stats.radii_px = torch.from_numpy(radius)
-        return torch.from_numpy(image), torch.from_numpy(1 - transmittance)
+        color, z, alpha = (torch.from_numpy(image) for image in images)
+        return color, z, alpha
 
     @staticmethod
-    def backward(ctx: Any, image_grad: torch.Tensor, alpha_grad: torch.Tensor) -> tuple[Any, ...]:  # type: ignore[override]
-        inputs, view, lens, radius, pairs, tile_input, image, transmittance, stop, columns = ctx.state
-        means, quats, scales, _ = inputs
-        count, (height, width) = len(means), transmittance.shape
-        upstream = [np.ascontiguousarray(g.numpy()) for g in (image_grad, alpha_grad)]
-        pair_grads = np.zeros((len(pairs[1]), GRADS), np.float32)
-        blended = image, transmittance, stop, *upstream, pair_grads
-        in_blocks(tiles_backward, len(stop), width, height, columns, *tile_input, *blended)
-        grads, outputs = np.zeros((count, GRADS), np.float32), np.zeros((count, 10), np.float32)
+    def backward(ctx: Any, *upstream: torch.Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        inputs, view, lens, groups, rows, images, used = ctx.state
+        count, (height, width) = len(rows), images[1].shape
+        grads = tuple(np.ascontiguousarray(g.numpy()) for g in upstream)
+        pair_start = np.concatenate([np.zeros(1, np.int64), used.ravel().cumsum()])
+        pairs = np.empty(pair_start[-1], np.int32), np.empty((pair_start[-1], SUMS), np.float32)
+        in_blocks(tiles_backward, len(used), width, height, *groups, rows, images, grads, pair_start, *pairs)
+        outputs = tuple(np.empty((count, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (3,), (2,)))
         view_grad = np.zeros((_CHUNKS, 4, 4), np.float64)
-        conic, start, place = tile_input[3], pairs[2], pairs[3]
-        chain = conic, radius, start, place, pair_grads, grads, outputs, view_grad
-        in_blocks(project_backward, _CHUNKS, means, quats, scales, view, lens, *chain)
+        in_blocks(project_backward, _CHUNKS, inputs, view, lens, rows, *pairs, outputs, view_grad)
+        *input_grads, pixel_grad = (torch.from_numpy(output) for output in outputs)
         if ctx.stats is not None:
-            ctx.stats.mean_grad_px = torch.from_numpy(grads[:, :2].copy())
-        g, o = torch.from_numpy(grads), torch.from_numpy(outputs)
-        view_sum = torch.from_numpy(view_grad.sum(0))
-        return o[:, :3], o[:, 3:7], o[:, 7:], g[:, 5], g[:, 6:9], view_sum, None, None, None, None, None
+            ctx.stats.mean_grad_px = pixel_grad
+        return *input_grads, torch.from_numpy(view_grad.sum(0)), None, None, None, None, None
 
 
 def rasterise_cpu(
@@ -92,8 +86,10 @@ def rasterise_cpu(
     shifted = intrinsics.detach().double().numpy().copy()
     shifted[:2, 2] += 0.5  # our integers are pixel centres; the kernels sample at +0.5, as gsplat does
     arrays = (means.float(), quats.float(), scales.float(), opacities.float(), colors.float(), view.double())
-    image, alpha = _Rasterise.apply(*arrays, shifted, (width, height), near, eps2d, stats)
-    return image[..., :3], image[..., 3], alpha
+    drawn: tuple[torch.Tensor, torch.Tensor, torch.Tensor] = _Rasterise.apply(
+        *arrays, shifted, (width, height), near, eps2d, stats
+    )
+    return drawn
 
 
 class NumbaBackend:

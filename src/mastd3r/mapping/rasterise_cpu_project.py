@@ -14,6 +14,25 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from .rasterise_cpu_blend import (
+    ALPHA_CUT,
+    CHANNELS,
+    ROW_A,
+    ROW_B,
+    ROW_C,
+    ROW_CHANNEL,
+    ROW_LOG2,
+    ROW_NARROW,
+    ROW_REACH_X,
+    ROW_REACH_Y,
+    ROW_SHEAR,
+    ROW_TURN,
+    ROW_WIDE,
+    ROW_X,
+    ROW_Y,
+    SUMS,
+)
+
 JIT: dict[str, Any] = {
     "fastmath": True,
     "cache": True,
@@ -21,9 +40,9 @@ JIT: dict[str, Any] = {
     "error_model": "numpy",
     "boundscheck": False,
 }
-ALPHA_CUT = 1 / 255
 FIELD_MARGIN = 0.15  # the Jacobian is taken at most this share of the width outside the image
-GRADS = 10  # columns of a gradient row: u, v, conic a, b, c, opacity, three colours, depth
+_LOG2_E = 1 / math.log(2)
+_WIDER = 1 + 1e-5  # share by which the square of an ellipse's width is taken larger, against rounding at its tips
 
 
 @njit(**JIT)
@@ -131,19 +150,35 @@ def _transposed_times(a, f):
 
 
 @njit(**JIT)
-def project_forward(
-    first, last, means, quats, scales, opacities, view, lens, near, eps2d, centre, conic, depth, radius
-):
-    """Gaussians first … last-1: centre (N,2), conic (N,3) = inverse 2-D covariance, depth (N,), radius (N,2).
+def _write_row(rows, i, u, v, var_x, cov_xy, var_y, determinant, opacity, spread):
+    """All that blending reads of Gaussian i but its channels; ``spread`` = squared standard deviations to alpha 1/255."""
+    rows[i, ROW_X] = u
+    rows[i, ROW_Y] = v
+    rows[i, ROW_A] = -0.5 * _LOG2_E * var_y / determinant
+    rows[i, ROW_B] = _LOG2_E * cov_xy / determinant
+    rows[i, ROW_C] = -0.5 * _LOG2_E * var_x / determinant
+    rows[i, ROW_LOG2] = _LOG2_E * math.log(opacity)
+    rows[i, ROW_REACH_X] = math.sqrt(spread * var_x)
+    rows[i, ROW_REACH_Y] = math.sqrt(spread * var_y)
+    rows[i, ROW_TURN] = cov_xy * math.sqrt(spread / var_x)
+    rows[i, ROW_SHEAR] = cov_xy / var_y
+    rows[i, ROW_WIDE] = _WIDER * spread * determinant / var_y
+    rows[i, ROW_NARROW] = determinant / (var_y * var_y)
 
-    Radius 0 = not seen.
+
+@njit(**JIT)
+def project_forward(first, last, means, quats, scales, opacities, colors, view, lens, near, eps2d, rows, depth, radius):
+    """Gaussians first … last-1: rows (N,16) for blending, depth (N,), radius (N,2) of the drawn box, px.
+
+    Radius 0 = not seen; such a row is not written.
     """
     for i in range(first, last):
         radius[i, 0] = 0
         radius[i, 1] = 0
         x, y, z = _to_camera(view, means, i)
         depth[i] = z
-        if not z > near:
+        opacity = float(opacities[i])
+        if not (z > near and opacity >= ALPHA_CUT):
             continue
         w, qx, qy, qz, _ = _unit_quaternion(quats, i)
         shape = _scaled_columns(_rotation(w, qx, qy, qz), scales[i, 0], scales[i, 1], scales[i, 2])
@@ -153,37 +188,37 @@ def project_forward(
         cov_xy = b[0] * b[3] + b[1] * b[4] + b[2] * b[5]
         var_y = b[3] * b[3] + b[4] * b[4] + b[5] * b[5] + eps2d
         determinant = var_x * var_y - cov_xy * cov_xy
-        opacity = opacities[i]
-        if not (determinant > 0 and opacity >= ALPHA_CUT):
+        if not determinant > 0:
             continue
-        conic[i, 0] = var_y / determinant
-        conic[i, 1] = -cov_xy / determinant
-        conic[i, 2] = var_x / determinant
         u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
-        centre[i, 0] = u
-        centre[i, 1] = v
-        reach = math.sqrt(2 * math.log(opacity * 255.0))  # standard deviations to the 1/255 contour
-        radius_x, radius_y = math.ceil(reach * math.sqrt(var_x)), math.ceil(reach * math.sqrt(var_y))
+        spread = 2 * math.log(opacity * 255.0)
+        radius_x, radius_y = math.ceil(math.sqrt(spread * var_x)), math.ceil(math.sqrt(spread * var_y))
         if u + radius_x <= 0 or u - radius_x >= lens[4] or v + radius_y <= 0 or v - radius_y >= lens[5]:
             continue
         radius[i, 0] = min(radius_x, 2.0**30)
         radius[i, 1] = min(radius_y, 2.0**30)
+        _write_row(rows, i, u, v, var_x, cov_xy, var_y, determinant, opacity, spread)
+        for channel in range(CHANNELS - 1):
+            rows[i, ROW_CHANNEL + channel] = colors[i, channel]
+        rows[i, ROW_CHANNEL + CHANNELS - 1] = z
 
 
 @njit(**JIT)
-def _gather(start, place, pair_grads, i, grads):
-    """Sum the rows that the tiles left for Gaussian i, in a fixed order."""
-    for q in range(start[i], start[i + 1]):
-        p = place[q]
-        for c in range(GRADS):
-            grads[i, c] += pair_grads[p, c]
+def _screen_grads(rows, opacities, sums, i, row):
+    """Conic a, b, c of Gaussian i, and loss gradients of its pixel (2), conic (3) and opacity from the sums."""
+    a = -2 / _LOG2_E * float(rows[i, ROW_A])
+    b = -1 / _LOG2_E * float(rows[i, ROW_B])
+    c = -2 / _LOG2_E * float(rows[i, ROW_C])
+    gx, gy = float(sums[row, 1]), float(sums[row, 2])
+    conic_grad = -0.5 * sums[row, 3], -1.0 * sums[row, 4], -0.5 * sums[row, 5]
+    return (a, b, c), (a * gx + b * gy, b * gx + c * gy), conic_grad, sums[row, 0] / opacities[i]
 
 
 @njit(**JIT)
-def _covariance_grad(conic, grads, i):
+def _covariance_grad(conic, conic_grad):
     """Gradient of the 2-D covariance from that of its inverse: -X G X, G symmetric."""
-    a, b, c = float(conic[i, 0]), float(conic[i, 1]), float(conic[i, 2])
-    ga, gb, gc = float(grads[i, 2]), 0.5 * float(grads[i, 3]), float(grads[i, 4])
+    a, b, c = conic
+    ga, gb, gc = conic_grad[0], 0.5 * conic_grad[1], conic_grad[2]
     p00, p01, p10, p11 = a * ga + b * gb, a * gb + b * gc, b * ga + c * gb, b * gb + c * gc
     return -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
 
@@ -205,14 +240,14 @@ def _quaternion_grad(w, x, y, z, inverse_norm, h):
 
 
 @njit(**JIT)
-def _point_grad(x, y, z, lens, slopes, grads, i, jacobian_grad):
+def _point_grad(x, y, z, lens, slopes, pixel_grad, depth_grad, jacobian_grad):
     """Gradient of the camera-frame point: through the pixel, the depth channel and the Jacobian."""
     fx, fy = lens[0], lens[1]
     _, _, _, _, x_used, y_used, x_free, y_free = slopes
     g00, g02, g11, g12 = jacobian_grad
-    r, gu, gv = 1.0 / z, float(grads[i, 0]), float(grads[i, 1])
+    r, gu, gv = 1.0 / z, pixel_grad[0], pixel_grad[1]
     gx, gy = fx * r * gu, fy * r * gv
-    gz = -(fx * x * gu + fy * y * gv) * r * r + float(grads[i, 9]) - (fx * g00 + fy * g11) * r * r
+    gz = -(fx * x * gu + fy * y * gv) * r * r + depth_grad - (fx * g00 + fy * g11) * r * r
     if x_free:
         gx -= fx * r * r * g02
         gz += 2 * fx * x_used * r * r * r * g02
@@ -249,63 +284,105 @@ def _jacobian_grad(product_grad, view):
 
 
 @njit(**JIT)
+def _sum_pairs(first, last, pair_gaussian, pair_sums):
+    """Rows that the tiles left for Gaussians first … last-1, summed in the order of the tiles."""
+    sums = np.zeros((last - first, SUMS), np.float32)
+    for p in range(len(pair_gaussian)):
+        row = pair_gaussian[p] - first
+        if 0 <= row < last - first:
+            for k in range(SUMS):
+                sums[row, k] += pair_sums[p, k]
+    return sums
+
+
+@njit(**JIT)
+def _any(sums, row):
+    for k in range(SUMS):
+        if sums[row, k] != 0:
+            return True
+    return False
+
+
+@njit(**JIT)
 def project_backward(
     first,
     last,
-    means,
-    quats,
-    scales,
+    inputs,
     view,
     lens,
-    conic,
-    radius,
-    start,
-    place,
-    pair_grads,
-    grads,
+    rows,
+    pair_gaussian,
+    pair_sums,
     outputs,
     view_grad,
 ):
     """Chain rule for chunks first … last-1 of all Gaussians.
 
-    From pair gradients to outputs (N,10: mean 3, quaternion 4, scale 3) and view (chunks,4,4).
-    ``grads`` (N, GRADS) receives the sums over the tiles. The result does not depend on the threads.
+    From the sums of the pairs to ``outputs`` (mean (N,3), quaternion (N,4), scale (N,3), opacity (N,), colour (N,3),
+    pixel (N,2), all zero where a Gaussian was not seen) and view (chunks,4,4). The result does not depend on the split.
     """
+    means, quats, scales, opacities = inputs
     count, chunks = means.shape[0], view_grad.shape[0]
+    begin = first * count // chunks
+    sums = _sum_pairs(begin, last * count // chunks, pair_gaussian, pair_sums)
     for chunk in range(first, last):
         for i in range(chunk * count // chunks, (chunk + 1) * count // chunks):
-            if radius[i, 0] <= 0:
-                continue
-            _gather(start, place, pair_grads, i, grads)
-            x, y, z = _to_camera(view, means, i)
-            w, qx, qy, qz, inverse_norm = _unit_quaternion(quats, i)
-            r = _rotation(w, qx, qy, qz)
-            s0, s1, s2 = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
-            shape = _scaled_columns(r, s0, s1, s2)
-            slopes = _slopes(x, y, z, lens)
-            a = _jacobian_times_view(slopes[0], slopes[1], slopes[2], slopes[3], view)
-            b = _times(a, shape)
-            e00, e01, e11 = _covariance_grad(conic, grads, i)  # cov = b b^T + eps
-            f = (
-                2 * (e00 * b[0] + e01 * b[3]),
-                2 * (e00 * b[1] + e01 * b[4]),
-                2 * (e00 * b[2] + e01 * b[5]),
-                2 * (e01 * b[0] + e11 * b[3]),
-                2 * (e01 * b[1] + e11 * b[4]),
-                2 * (e01 * b[2] + e11 * b[5]),
-            )
-            m = _transposed_times(a, f)
-            product_grad = _times_transposed(f, shape)
-            point = _point_grad(x, y, z, lens, slopes, grads, i, _jacobian_grad(product_grad, view))
-            _add_view_grad(view_grad, chunk, slopes, product_grad, point, means, i)
-            for k in range(3):
-                outputs[i, k] = view[0, k] * point[0] + view[1, k] * point[1] + view[2, k] * point[2]
-            turn = _quaternion_grad(w, qx, qy, qz, inverse_norm, _scaled_columns(m, s0, s1, s2))
-            for k in range(4):
-                outputs[i, 3 + k] = turn[k]
-            outputs[i, 7] = r[0] * m[0] + r[3] * m[3] + r[6] * m[6]
-            outputs[i, 8] = r[1] * m[1] + r[4] * m[4] + r[7] * m[7]
-            outputs[i, 9] = r[2] * m[2] + r[5] * m[5] + r[8] * m[8]
+            if _any(sums, i - begin):
+                _chain(i, sums, i - begin, means, quats, scales, opacities, view, lens, rows, outputs, view_grad, chunk)
+            else:
+                _no_gradient(outputs, i)
+
+
+@njit(**JIT)
+def _no_gradient(outputs, i):
+    mean_grad, quat_grad, scale_grad, opacity_grad, color_grad, pixel_grad = outputs
+    opacity_grad[i] = 0
+    for k in range(4):
+        quat_grad[i, k] = 0
+    for k in range(3):
+        mean_grad[i, k] = 0
+        scale_grad[i, k] = 0
+        color_grad[i, k] = 0
+    for k in range(2):
+        pixel_grad[i, k] = 0
+
+
+@njit(**JIT)
+def _chain(i, sums, row, means, quats, scales, opacities, view, lens, rows, outputs, view_grad, chunk):
+    mean_grad, quat_grad, scale_grad, opacity_grad, color_grad, pixel_grad = outputs
+    x, y, z = _to_camera(view, means, i)
+    w, qx, qy, qz, inverse_norm = _unit_quaternion(quats, i)
+    r = _rotation(w, qx, qy, qz)
+    s0, s1, s2 = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
+    shape = _scaled_columns(r, s0, s1, s2)
+    slopes = _slopes(x, y, z, lens)
+    a = _jacobian_times_view(slopes[0], slopes[1], slopes[2], slopes[3], view)
+    b = _times(a, shape)
+    conic, pixel, conic_grad, opacity_grad[i] = _screen_grads(rows, opacities, sums, i, row)
+    e00, e01, e11 = _covariance_grad(conic, conic_grad)  # cov = b b^T + eps
+    f = (
+        2 * (e00 * b[0] + e01 * b[3]),
+        2 * (e00 * b[1] + e01 * b[4]),
+        2 * (e00 * b[2] + e01 * b[5]),
+        2 * (e01 * b[0] + e11 * b[3]),
+        2 * (e01 * b[1] + e11 * b[4]),
+        2 * (e01 * b[2] + e11 * b[5]),
+    )
+    m = _transposed_times(a, f)
+    product_grad = _times_transposed(f, shape)
+    point = _point_grad(x, y, z, lens, slopes, pixel, float(sums[row, 9]), _jacobian_grad(product_grad, view))
+    _add_view_grad(view_grad, chunk, slopes, product_grad, point, means, i)
+    turn = _quaternion_grad(w, qx, qy, qz, inverse_norm, _scaled_columns(m, s0, s1, s2))
+    for k in range(4):
+        quat_grad[i, k] = turn[k]
+    for k in range(3):
+        mean_grad[i, k] = view[0, k] * point[0] + view[1, k] * point[1] + view[2, k] * point[2]
+        color_grad[i, k] = sums[row, 6 + k]
+    scale_grad[i, 0] = r[0] * m[0] + r[3] * m[3] + r[6] * m[6]
+    scale_grad[i, 1] = r[1] * m[1] + r[4] * m[4] + r[7] * m[7]
+    scale_grad[i, 2] = r[2] * m[2] + r[5] * m[5] + r[8] * m[8]
+    pixel_grad[i, 0] = pixel[0]
+    pixel_grad[i, 1] = pixel[1]
 
 
 def view_parameters(view: Any, intrinsics: Any, width: int, height: int) -> tuple[Any, Any]:

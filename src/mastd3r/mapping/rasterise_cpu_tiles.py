@@ -1,210 +1,190 @@
-"""Sorting of Gaussians into 16 x 16 tiles, and the loops over tiles that blend them."""
+"""The loops over 16 x 16 tiles that blend Gaussians, forward and backward."""
 
 # mypy: disallow-untyped-defs=False
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
+from .rasterise_cpu_bin import GROUP, GROUP_PIXELS
 from .rasterise_cpu_blend import (
+    BANDS,
+    BLOCK_BACKWARD,
+    BLOCK_FORWARD,
+    BLOCKS,
     CHANNELS,
+    PIXELS,
     PLANE_BEHIND,
     PLANE_COLOR,
     PLANE_COLOR_GRAD,
-    PLANE_LIVE,
     PLANE_TRANSMITTANCE,
-    ROW_BACKWARD,
-    ROW_FORWARD,
-    SUMS,
+    ROW,
+    ROW_REACH_X,
+    ROW_REACH_Y,
+    ROW_X,
+    ROW_Y,
     TILE,
     blend_backward,
     blend_forward,
+    block_open,
+    ellipse_blocks,
 )
 from .rasterise_cpu_project import JIT
+from .simd import LANES
 
-_LANES = 8
-_LIVE_CHECK = 64  # Gaussians blended between two looks at whether a tile is opaque
-_RADIX_BITS = 11
+CHUNK = 32  # Gaussians blended between two looks at which blocks of a tile are opaque
 _F = np.float32
 
 
 @njit(**JIT)
-def depth_order(depth, radius):
-    """Seen Gaussians, near to far; equal depths keep their order (radix sort of positive float32 bits)."""
-    bits = depth.view(np.int32)
-    order = np.flatnonzero(radius[:, 0] > 0).astype(np.int32)
-    other = np.empty_like(order)
-    buckets = 1 << _RADIX_BITS
-    for part in range(3):
-        shift = part * _RADIX_BITS
-        first = np.zeros(buckets + 1, np.int32)
-        for i in order:
-            first[((bits[i] >> shift) & (buckets - 1)) + 1] += 1
-        for k in range(buckets):
-            first[k + 1] += first[k]
-        for i in order:
-            key = (bits[i] >> shift) & (buckets - 1)
-            other[first[key]] = i
-            first[key] += 1
-        order, other = other, order
-    return order
+def _next_chunk(at, end, group_gaussian, rows, x0, y0, blocks, near, number, reached):
+    """The next Gaussians of a group's list that reach ``blocks`` of the tile at x0, y0: how many, and where it goes on.
 
-
-@njit(**JIT)
-def bin_tiles(order, centre, radius, columns, rows):
-    """Lists of Gaussians per tile, near to far, and the way back.
-
-    Returns tile_start (tiles+1), pair_gaussian (M), gaussian_start (N+1), pair_place (M): the pairs of
-    Gaussian i are pair_place[gaussian_start[i] : gaussian_start[i+1]].
+    Their rows go to ``near`` (CHUNK,16), centres relative to the tile, their numbers and blocks to the other two.
     """
-    count = radius.shape[0]
-    tile_start = np.zeros(columns * rows + 1, np.int64)
-    gaussian_start = np.zeros(count + 1, np.int64)
-    box = np.zeros((count, 4), np.int32)
-    for i in order:
-        u, v, rx, ry = float(centre[i, 0]), float(centre[i, 1]), float(radius[i, 0]), float(radius[i, 1])
-        box[i, 0] = max(0.0, math.floor((u - rx) / TILE))
-        box[i, 1] = min(float(columns), math.ceil((u + rx) / TILE))
-        box[i, 2] = max(0.0, math.floor((v - ry) / TILE))
-        box[i, 3] = min(float(rows), math.ceil((v + ry) / TILE))
-        gaussian_start[i + 1] = max(0, box[i, 1] - box[i, 0]) * max(0, box[i, 3] - box[i, 2])
-        for ty in range(box[i, 2], box[i, 3]):
-            for tx in range(box[i, 0], box[i, 1]):
-                tile_start[ty * columns + tx + 1] += 1
-    for t in range(columns * rows):
-        tile_start[t + 1] += tile_start[t]
-    for i in range(count):
-        gaussian_start[i + 1] += gaussian_start[i]
-    pair_gaussian = np.empty(tile_start[-1], np.int32)
-    pair_place = np.empty(tile_start[-1], np.int32)
-    fill = tile_start[:-1].copy()
-    for i in order:
-        q = gaussian_start[i]
-        for ty in range(box[i, 2], box[i, 3]):
-            for tx in range(box[i, 0], box[i, 1]):
-                place = fill[ty * columns + tx]
-                fill[ty * columns + tx] = place + 1
-                pair_gaussian[place] = i
-                pair_place[q] = place
-                q += 1
-    return tile_start, pair_gaussian, gaussian_start, pair_place
+    count = 0
+    while at < end and count < CHUNK:
+        g = group_gaussian[at]
+        at += 1
+        x, y = _F(rows[g, ROW_X] - _F(x0) - _F(0.5)), _F(rows[g, ROW_Y] - _F(y0) - _F(0.5))
+        reach_x, reach_y = rows[g, ROW_REACH_X], rows[g, ROW_REACH_Y]
+        if x + reach_x < 0 or x - reach_x > TILE - 1 or y + reach_y < 0 or y - reach_y > TILE - 1:
+            continue
+        here = ellipse_blocks(rows, g, x, y) & blocks
+        if here:
+            for k in range(ROW):
+                near[count, k] = rows[g, k]
+            near[count, ROW_X], near[count, ROW_Y] = x, y
+            number[count], reached[count] = g, here
+            count += 1
+    return count, at
 
 
 @njit(**JIT)
-def _reach(i, centre, conic, opacities, x0, y0):
-    """What blending needs of a Gaussian in a tile: conic, opacity, centre, largest power, rows, half rows."""
-    a, b, c, opacity = conic[i, 0], conic[i, 1], conic[i, 2], opacities[i]
-    x, y = _F(centre[i, 0] - _F(x0) - _F(0.5)), _F(centre[i, 1] - _F(y0) - _F(0.5))
-    power_max = _F(math.log(opacity * _F(255.0)))
-    spread = _F(2) * power_max / (a * c - b * b)
-    reach_y, reach_x = _F(math.sqrt(spread * a)), _F(math.sqrt(spread * c))
-    row0, row1 = int(max(_F(0), math.ceil(y - reach_y))), int(min(_F(TILE), math.floor(y + reach_y) + _F(1)))
-    half0 = 1 if x - reach_x > _F(7) else 0
-    half1 = 1 if x + reach_x < _F(8) else 2
-    if x + reach_x < _F(0) or x - reach_x > _F(15):
-        row1 = row0
-    return a, b, c, opacity, x, y, power_max, row0, max(row0, row1), half0, half1
+def _blocks_inside(rows, columns):
+    """Blocks that have a pixel among the first rows and columns of a tile."""
+    blocks = 0
+    for block in range(BLOCKS):
+        if block // BANDS * LANES < columns and block % BANDS * 2 < rows:
+            blocks |= 1 << block
+    return blocks
 
 
 @njit(**JIT)
-def tiles_forward(
-    first,
-    last,
-    width,
-    height,
-    columns,
-    tile_start,
-    pair_gaussian,
-    centre,
-    conic,
-    opacities,
-    features,
-    image,
-    transmittance,
-    stop,
-):
-    """Blend tiles first … last-1 into image (h,w,4) and transmittance (h,w).
+def _place(block, pixel):
+    """Row and column in the tile of a pixel of a block."""
+    return block % BANDS * 2 + pixel // LANES, block // BANDS * LANES + pixel % LANES
 
-    ``stop`` = end of the part of each tile's list that counted.
+
+@njit(**JIT)
+def _start_forward(tile, rows, columns):
+    for block in range(BLOCKS):
+        start = block * BLOCK_FORWARD
+        for k in range(BLOCK_FORWARD):
+            tile[start + k] = 0
+        for pixel in range(PIXELS):
+            y, x = _place(block, pixel)
+            tile[start + PLANE_TRANSMITTANCE * PIXELS + pixel] = 1 if y < rows and x < columns else -1
+
+
+@njit(**JIT)
+def _finish_forward(tile, rows, columns, x0, y0, color, depth, alpha):
+    for block in range(BLOCKS):
+        for pixel in range(PIXELS):
+            y, x = _place(block, pixel)
+            if y < rows and x < columns:
+                at = block * BLOCK_FORWARD + pixel
+                alpha[y0 + y, x0 + x] = _F(1) - abs(tile[at + PLANE_TRANSMITTANCE * PIXELS])
+                for channel in range(CHANNELS - 1):
+                    color[y0 + y, x0 + x, channel] = tile[at + (PLANE_COLOR + channel) * PIXELS]
+                depth[y0 + y, x0 + x] = tile[at + (PLANE_COLOR + CHANNELS - 1) * PIXELS]
+
+
+@njit(**JIT)
+def tiles_forward(first, last, width, height, group_start, group_gaussian, rows, color, depth, alpha, used):
+    """Draw groups first … last-1 of tiles: color (h,w,3), depth (h,w), alpha (h,w).
+
+    ``used`` (groups, 16): how many Gaussians of the list came to each tile before it was opaque.
     """
-    for t in range(first, last):
-        y0, x0 = (t // columns) * TILE, (t % columns) * TILE
-        rows, cols = min(TILE, height - y0), min(TILE, width - x0)
-        tile = np.zeros(TILE * ROW_FORWARD, np.float32)
-        for y in range(TILE):
-            for x in range(TILE):
-                tile[y * ROW_FORWARD + PLANE_TRANSMITTANCE * TILE + x] = _F(1)
-                tile[y * ROW_FORWARD + PLANE_LIVE * TILE + x] = _F(1 if y < rows and x < cols else 0)
-        k, end = tile_start[t], tile_start[t + 1]
-        while k < end:
-            until = min(end, k + _LIVE_CHECK)
-            for pair in range(k, until):
-                g = pair_gaussian[pair]
-                a, b, c, opacity, x, y, power_max, row0, row1, half0, half1 = _reach(
-                    g, centre, conic, opacities, x0, y0
-                )
-                blend_forward(tile, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, g)
-            k = until
-            live = _F(0)
-            for y in range(TILE):
-                for x in range(TILE):
-                    live += tile[y * ROW_FORWARD + PLANE_LIVE * TILE + x]
-            if live == _F(0):
-                break
-        stop[t] = k
-        for y in range(rows):
-            for x in range(cols):
-                transmittance[y0 + y, x0 + x] = tile[y * ROW_FORWARD + PLANE_TRANSMITTANCE * TILE + x]
-                for channel in range(CHANNELS):
-                    value = tile[y * ROW_FORWARD + (PLANE_COLOR + channel) * TILE + x]
-                    image[y0 + y, x0 + x, channel] = value
+    tile = np.empty(BLOCKS * BLOCK_FORWARD, np.float32)
+    near, number, reached = np.empty((CHUNK, ROW), np.float32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int64)
+    listed, length = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int64)
+    across = (width + GROUP_PIXELS - 1) // GROUP_PIXELS
+    for group in range(first, last):
+        for t in range(GROUP * GROUP):
+            x0, y0 = (group % across * GROUP + t % GROUP) * TILE, (group // across * GROUP + t // GROUP) * TILE
+            used[group, t] = 0
+            if x0 >= width or y0 >= height:
+                continue
+            inside = min(TILE, height - y0), min(TILE, width - x0)
+            _start_forward(tile, *inside)
+            blocks = _blocks_inside(*inside)
+            at, end = group_start[group], group_start[group + 1]
+            while blocks and at < end:
+                count, at = _next_chunk(at, end, group_gaussian, rows, x0, y0, blocks, near, number, reached)
+                used[group, t] += count
+                length[:] = 0
+                for k in range(count):
+                    for block in range(BLOCKS):
+                        listed[block * CHUNK + length[block]] = k
+                        length[block] += (reached[k] >> block) & 1
+                for block in range(BLOCKS):
+                    if length[block] and not blend_forward(tile, block, near, listed, block * CHUNK, length[block]):
+                        blocks &= ~(1 << block)
+            _finish_forward(tile, *inside, x0, y0, color, depth, alpha)
 
 
 @njit(**JIT)
-def _start_backward(tile, x0, y0, rows, cols, image, transmittance, image_grad, alpha_grad):
-    for y in range(TILE):
-        for x in range(TILE):
-            tile[y * ROW_BACKWARD + PLANE_TRANSMITTANCE * TILE + x] = _F(1)
-    for y in range(rows):
-        for x in range(cols):
-            tile[y * ROW_BACKWARD + PLANE_LIVE * TILE + x] = _F(1)
-            behind = -transmittance[y0 + y, x0 + x] * alpha_grad[y0 + y, x0 + x]
+def _start_backward(tile, rows, columns, x0, y0, color, depth, alpha, color_grad, depth_grad, alpha_grad):
+    for block in range(BLOCKS):
+        for pixel in range(PIXELS):
+            y, x = _place(block, pixel)
+            at = block * BLOCK_BACKWARD + pixel
+            behind, last = _F(0), (PLANE_COLOR_GRAD + CHANNELS - 1) * PIXELS
             for channel in range(CHANNELS):
-                grad = image_grad[y0 + y, x0 + x, channel]
-                tile[y * ROW_BACKWARD + (PLANE_COLOR_GRAD + channel) * TILE + x] = grad
-                behind += grad * image[y0 + y, x0 + x, channel]
-            tile[y * ROW_BACKWARD + PLANE_BEHIND * TILE + x] = behind
+                tile[at + (PLANE_COLOR_GRAD + channel) * PIXELS] = 0
+            inside = y < rows and x < columns
+            if inside:
+                v, u = y0 + y, x0 + x
+                behind = (alpha[v, u] - _F(1)) * alpha_grad[v, u]
+                for channel in range(CHANNELS - 1):
+                    tile[at + (PLANE_COLOR_GRAD + channel) * PIXELS] = color_grad[v, u, channel]
+                    behind += color_grad[v, u, channel] * color[v, u, channel]
+                tile[at + last] = depth_grad[v, u]
+                behind += depth_grad[v, u] * depth[v, u]
+            tile[at + PLANE_TRANSMITTANCE * PIXELS] = 1 if inside else -1
+            tile[at + PLANE_BEHIND * PIXELS] = behind
 
 
 @njit(**JIT)
 def tiles_backward(
-    first, last, width, height, columns, tile_start, pair_gaussian, centre, conic, opacities, features,
-    image, transmittance, stop, image_grad, alpha_grad, pair_grads,
+    first, last, width, height, group_start, group_gaussian, rows, images, grads, pair_start, pair_gaussian, pair_sums
 ):  # fmt: skip
-    """Tiles first … last-1: fill pair_grads (M, 10) of every pair before the tile's stop."""
-    for t in range(first, last):
-        y0, x0 = (t // columns) * TILE, (t % columns) * TILE
-        tile = np.zeros(TILE * ROW_BACKWARD, np.float32)
-        lanes = np.zeros(_LANES * SUMS, np.float32)
-        sums = np.zeros(SUMS, np.float32)
-        rows, cols = min(TILE, height - y0), min(TILE, width - x0)
-        _start_backward(tile, x0, y0, rows, cols, image, transmittance, image_grad, alpha_grad)
-        for pair in range(tile_start[t], stop[t]):
-            g = pair_gaussian[pair]
-            a, b, c, opacity, x, y, power_max, row0, row1, half0, half1 = _reach(g, centre, conic, opacities, x0, y0)
-            blend_backward(tile, lanes, row0, row1, half0, half1, a, b, c, opacity, x, y, power_max, features, g)
-            for i in range(SUMS):
-                total = _F(0)
-                for lane in range(_LANES):
-                    total += lanes[i * _LANES + lane]
-                sums[i] = total
-            pair_grads[pair, 0] = a * sums[1] + b * sums[2]
-            pair_grads[pair, 1] = b * sums[1] + c * sums[2]
-            pair_grads[pair, 2] = -_F(0.5) * sums[3]
-            pair_grads[pair, 3] = -sums[4]
-            pair_grads[pair, 4] = -_F(0.5) * sums[5]
-            pair_grads[pair, 5] = sums[0] / opacity
-            for channel in range(CHANNELS):
-                pair_grads[pair, 6 + channel] = sums[6 + channel]
+    """Groups first … last-1: what ``tiles_forward`` did again, and the gradient sums of every Gaussian in every tile.
+
+    The pairs of tile t are rows pair_start[t] … of pair_gaussian (M,), -1 = none, and pair_sums (M,10). ``images`` =
+    colour, depth and alpha as drawn, ``grads`` = the loss gradients of the three.
+    """
+    tile = np.empty(BLOCKS * BLOCK_BACKWARD, np.float32)
+    near, number, reached = np.empty((CHUNK, ROW), np.float32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int64)
+    across = (width + GROUP_PIXELS - 1) // GROUP_PIXELS
+    for group in range(first, last):
+        for t in range(GROUP * GROUP):
+            pair, pair_end = pair_start[group * GROUP * GROUP + t], pair_start[group * GROUP * GROUP + t + 1]
+            if pair == pair_end:
+                continue
+            x0, y0 = (group % across * GROUP + t % GROUP) * TILE, (group // across * GROUP + t // GROUP) * TILE
+            inside = min(TILE, height - y0), min(TILE, width - x0)
+            _start_backward(tile, *inside, x0, y0, *images, *grads)
+            blocks = _blocks_inside(*inside)
+            at, end = group_start[group], group_start[group + 1]
+            while blocks and at < end and pair < pair_end:
+                count, at = _next_chunk(at, end, group_gaussian, rows, x0, y0, blocks, near, number, reached)
+                for k in range(min(count, pair_end - pair)):  # rounding could differ from the pass forward
+                    pair_gaussian[pair] = number[k]
+                    blend_backward(tile, near, k, reached[k], pair_sums, pair)
+                    pair += 1
+                for block in range(BLOCKS):
+                    if (blocks >> block) & 1 and not block_open(tile, block):
+                        blocks &= ~(1 << block)
+            pair_gaussian[pair:pair_end] = -1

@@ -19,6 +19,10 @@ INDEX = ir.IntType(64)
 VECTOR = ir.VectorType(FLOAT, LANES)
 _INT32 = ir.IntType(32)
 ZERO = ir.Constant(VECTOR, [ir.Constant(FLOAT, 0.0)] * LANES)
+_INT_VECTOR = ir.VectorType(_INT32, LANES)
+_HALF = ir.VectorType(FLOAT, 4)
+# 2^x for |x| <= 1/2, highest power first: least largest relative error, 8e-8
+_EXP2 = (0.001327647129, 0.009675540961, 0.05550713093, 0.2402212024, 0.693146944, 1.000000119)
 
 
 def constant(value: float) -> Any:
@@ -41,7 +45,7 @@ class Lanes:
         if isinstance(other, Lanes):
             return other.value
         if isinstance(other, int | float):
-            return ir.Constant(VECTOR, [constant(other)] * LANES)
+            return _splat(other)
         return broadcast(self.builder, other).value
 
     def _binary(self, operation: Callable[..., Any], left: Any, right: Any) -> Lanes:
@@ -73,15 +77,23 @@ class Lanes:
         """Lane mask of self > other."""
         return self.builder.fcmp_ordered(">", self.value, self._operand(other))
 
-    def at_most(self, limit: float) -> Lanes:
+    def at_most(self, limit: Any) -> Lanes:
         """min(self, limit)."""
         bound = self._operand(limit)
-        chosen = self.builder.select(self.builder.fcmp_ordered("<", self.value, bound), self.value, bound)
-        return Lanes(self.builder, chosen)
+        return Lanes(self.builder, self.builder.select(self.below(limit), self.value, bound))
 
-    def where(self, mask: Any) -> Lanes:
-        """self where the mask is true, 0 elsewhere."""
-        return Lanes(self.builder, self.builder.select(mask, self.value, ZERO))
+    def at_least(self, limit: Any) -> Lanes:
+        """max(self, limit)."""
+        bound = self._operand(limit)
+        return Lanes(self.builder, self.builder.select(self.above(limit), self.value, bound))
+
+    def where(self, mask: Any, otherwise: Any = 0.0) -> Lanes:
+        """self where the mask is true, ``otherwise`` elsewhere."""
+        return Lanes(self.builder, self.builder.select(mask, self.value, self._operand(otherwise)))
+
+
+def _splat(value: float) -> Any:
+    return ir.Constant(VECTOR, [constant(value)] * LANES)
 
 
 def broadcast(builder: Any, scalar: Any) -> Lanes:
@@ -97,15 +109,70 @@ def lane_numbers(builder: Any) -> Lanes:
     return Lanes(builder, ir.Constant(VECTOR, [constant(i) for i in range(LANES)]))
 
 
-def exp_negative(x: Lanes) -> Lanes:
-    """exp(x) for x in -6 … 0: a degree-6 series of x/16, to the 16th power; relative error below 1e-6."""
-    y = x * (1 / 16)
-    series = y * (1 / 720) + 1 / 120
-    for coefficient in (1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
-        series = series * y + coefficient
-    for _ in range(4):
-        series = series * series
-    return series
+def exp2(x: Lanes) -> Lanes:
+    """2^x for x in -100 … 0: whole part into the exponent's bits, rest by a polynomial; relative error below 3e-7."""
+    builder = x.builder
+    whole = _of_one(x, "rint")
+    rest = x - whole
+    series = rest * _EXP2[0] + _EXP2[1]
+    for coefficient in _EXP2[2:]:
+        series = series * rest + coefficient
+    places = ir.Constant(_INT_VECTOR, [ir.Constant(_INT32, 23)] * LANES)
+    exponent = builder.shl(builder.fptosi(whole.value, _INT_VECTOR), places)
+    bits = builder.add(builder.bitcast(series.value, _INT_VECTOR), exponent)
+    return Lanes(builder, builder.bitcast(bits, VECTOR))
+
+
+def square_root(x: Lanes) -> Lanes:
+    """Of lanes that are not negative."""
+    return _of_one(x, "sqrt")
+
+
+def _of_one(x: Lanes, name: str) -> Lanes:
+    """LLVM's function of that name, lane by lane."""
+    kind = ir.FunctionType(VECTOR, [VECTOR])
+    function = cgutils.get_or_insert_function(x.builder.module, kind, f"llvm.{name}.v{LANES}f32")
+    return Lanes(x.builder, x.builder.call(function, [x.value]))
+
+
+def minus_size(x: Lanes) -> Lanes:
+    """-|x|."""
+    sign = ir.Constant(_INT_VECTOR, [ir.Constant(_INT32, -(2**31))] * LANES)
+    bits = x.builder.or_(x.builder.bitcast(x.value, _INT_VECTOR), sign)
+    return Lanes(x.builder, x.builder.bitcast(bits, VECTOR))
+
+
+def bits_of(builder: Any, mask: Any) -> Any:
+    """A lane mask as a 64-bit integer, lane 0 in the lowest bit."""
+    return builder.zext(builder.bitcast(mask, ir.IntType(LANES)), INDEX)
+
+
+def store_sums(builder: Any, base: Any, at: Any, vectors: list[Lanes]) -> None:
+    """Write the sum over the lanes of each of the vectors, one after the other from element ``at``."""
+    for first in range(0, len(vectors), 4):
+        group = [_half_sum(v) for v in vectors[first : first + 4]]
+        number = len(group)
+        group += [ir.Constant(_HALF, [constant(0.0)] * 4)] * (4 - number)
+        pairs = [_add_shuffled(builder, *group[i : i + 2], (0, 4, 1, 5), (2, 6, 3, 7)) for i in (0, 2)]
+        total = _add_shuffled(builder, *pairs, (0, 1, 4, 5), (2, 3, 6, 7))
+        if number < 4:
+            total = _shuffle(builder, total, total, tuple(range(number)))
+        place = builder.gep(base, [builder.add(at, index(first))], source_etype=FLOAT)
+        builder.store(total, builder.bitcast(place, total.type.as_pointer()), align=4)
+
+
+def _half_sum(x: Lanes) -> Any:
+    low, high = _shuffle(x.builder, x.value, x.value, (0, 1, 2, 3)), _shuffle(x.builder, x.value, x.value, (4, 5, 6, 7))
+    return x.builder.fadd(low, high)
+
+
+def _add_shuffled(builder: Any, a: Any, b: Any, one: tuple[int, ...], other: tuple[int, ...]) -> Any:
+    return builder.fadd(_shuffle(builder, a, b, one), _shuffle(builder, a, b, other))
+
+
+def _shuffle(builder: Any, a: Any, b: Any, lanes: tuple[int, ...]) -> Any:
+    order = ir.Constant(ir.VectorType(_INT32, len(lanes)), [ir.Constant(_INT32, lane) for lane in lanes])
+    return builder.shuffle_vector(a, b, order)
 
 
 def load(builder: Any, base: Any, at: Any) -> Lanes:

@@ -1,0 +1,76 @@
+"""Gaussians sorted by depth into groups of 4 x 4 tiles; each tile then picks its own from its group's list."""
+
+# mypy: disallow-untyped-defs=False
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from .rasterise_cpu_blend import ROW_X, ROW_Y, TILE
+from .rasterise_cpu_project import JIT
+
+GROUP = 4  # tiles along a side of a group
+GROUP_PIXELS = GROUP * TILE
+_RADIX_BITS = 11
+
+
+@njit(**JIT)
+def depth_order(depth, radius):
+    """Seen Gaussians, near to far; equal depths keep their order (radix sort of positive float32 bits)."""
+    bits = depth.view(np.int32)
+    buckets = 1 << _RADIX_BITS
+    first = np.zeros((3, buckets + 1), np.int32)
+    order = np.empty(len(depth), np.int32)
+    count = 0
+    for i in range(len(depth)):
+        if radius[i, 0] > 0:
+            order[count] = i
+            count += 1
+            for part in range(3):
+                first[part, ((bits[i] >> (part * _RADIX_BITS)) & (buckets - 1)) + 1] += 1
+    order = order[:count]
+    other = np.empty_like(order)
+    for part in range(3):
+        shift = part * _RADIX_BITS
+        for k in range(buckets):
+            first[part, k + 1] += first[part, k]
+        for i in order:
+            key = (bits[i] >> shift) & (buckets - 1)
+            other[first[part, key]] = i
+            first[part, key] += 1
+        order, other = other, order
+    return order
+
+
+@njit(**JIT)
+def _groups_of(i, rows, radius, columns, lines):
+    u, v, rx, ry = float(rows[i, ROW_X]), float(rows[i, ROW_Y]), float(radius[i, 0]), float(radius[i, 1])
+    left = int(max(0.0, math.floor((u - rx) / GROUP_PIXELS)))
+    right = int(min(float(columns), math.ceil((u + rx) / GROUP_PIXELS)))
+    top = int(max(0.0, math.floor((v - ry) / GROUP_PIXELS)))
+    bottom = int(min(float(lines), math.ceil((v + ry) / GROUP_PIXELS)))
+    return left, right, top, bottom
+
+
+@njit(**JIT)
+def bin_groups(order, rows, radius, columns, lines):
+    """Lists of Gaussians per group, near to far: start (groups+1,), gaussian (M,)."""
+    start = np.zeros(columns * lines + 1, np.int64)
+    for i in order:
+        left, right, top, bottom = _groups_of(i, rows, radius, columns, lines)
+        for y in range(top, bottom):
+            for x in range(left, right):
+                start[y * columns + x + 1] += 1
+    for group in range(columns * lines):
+        start[group + 1] += start[group]
+    gaussian, fill = np.empty(start[-1], np.int32), start[:-1].copy()
+    for i in order:
+        left, right, top, bottom = _groups_of(i, rows, radius, columns, lines)
+        for y in range(top, bottom):
+            for x in range(left, right):
+                group = y * columns + x
+                gaussian[fill[group]] = i
+                fill[group] += 1
+    return start, gaussian
