@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from ..concurrency import in_blocks
-from .rasterise_cpu_bin import GROUP, GROUP_PIXELS, bin_groups, depth_order
-from .rasterise_cpu_blend import ROW, SUMS
+from .rasterise_cpu_bin import bin_groups, depth_order
+from .rasterise_cpu_blend import GROUP, GROUP_PIXELS, ROW, SUMS
 from .rasterise_cpu_project import project_backward, project_forward, view_parameters
 from .rasterise_cpu_tiles import tiles_backward, tiles_forward
 from .screen import ScreenStats
@@ -39,9 +39,10 @@ class _Rasterise(torch.autograd.Function):
         view_array, lens = view_parameters(view.detach().numpy(), intrinsics, width, height)
         rows = np.empty((count, ROW), np.float32)
         depth, radius = np.empty(count, np.float32), np.empty((count, 2), np.int32)
-        projected = np.ascontiguousarray(colors.detach().numpy()), view_array, lens, near, eps2d, rows, depth, radius
-        in_blocks(project_forward, count, *inputs, *projected)
-        groups = bin_groups(depth_order(depth, radius), rows, radius, columns, lines)
+        box, rgb = np.empty((count, 4), np.int16), np.ascontiguousarray(colors.detach().numpy())
+        projected = rows, depth, radius, box
+        in_blocks(project_forward, count, *inputs, rgb, view_array, lens, near, eps2d, *projected)
+        groups = bin_groups(depth_order(depth, radius), box, columns, lines)
         images = tuple(np.empty((height, width, *channels), np.float32) for channels in ((3,), (), ()))
         used = np.empty((columns * lines, GROUP * GROUP), np.int64)
         in_blocks(tiles_forward, columns * lines, width, height, *groups, rows, *images, used)

@@ -1,18 +1,13 @@
-"""Gaussians sorted by depth into groups of 4 x 4 tiles; each tile then picks its own from its group's list."""
+"""Gaussians sorted by depth into groups of tiles; each tile then picks its own from its group's list."""
 
 # mypy: disallow-untyped-defs=False
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
-from .rasterise_cpu_blend import ROW_X, ROW_Y, TILE
 from .rasterise_cpu_project import JIT
 
-GROUP = 4  # tiles along a side of a group
-GROUP_PIXELS = GROUP * TILE
 _RADIX_BITS = 11
 
 
@@ -45,31 +40,19 @@ def depth_order(depth, radius):
 
 
 @njit(**JIT)
-def _groups_of(i, rows, radius, columns, lines):
-    u, v, rx, ry = float(rows[i, ROW_X]), float(rows[i, ROW_Y]), float(radius[i, 0]), float(radius[i, 1])
-    left = int(max(0.0, math.floor((u - rx) / GROUP_PIXELS)))
-    right = int(min(float(columns), math.ceil((u + rx) / GROUP_PIXELS)))
-    top = int(max(0.0, math.floor((v - ry) / GROUP_PIXELS)))
-    bottom = int(min(float(lines), math.ceil((v + ry) / GROUP_PIXELS)))
-    return left, right, top, bottom
-
-
-@njit(**JIT)
-def bin_groups(order, rows, radius, columns, lines):
-    """Lists of Gaussians per group, near to far: start (groups+1,), gaussian (M,)."""
+def bin_groups(order, box, columns, lines):
+    """Lists of Gaussians per group, near to far: start (groups+1,), gaussian (M,). ``box`` as projected."""
     start = np.zeros(columns * lines + 1, np.int64)
-    for i in order:
-        left, right, top, bottom = _groups_of(i, rows, radius, columns, lines)
-        for y in range(top, bottom):
-            for x in range(left, right):
+    for i in range(len(box)):
+        for y in range(box[i, 2], box[i, 3]):
+            for x in range(box[i, 0], box[i, 1]):
                 start[y * columns + x + 1] += 1
     for group in range(columns * lines):
         start[group + 1] += start[group]
     gaussian, fill = np.empty(start[-1], np.int32), start[:-1].copy()
     for i in order:
-        left, right, top, bottom = _groups_of(i, rows, radius, columns, lines)
-        for y in range(top, bottom):
-            for x in range(left, right):
+        for y in range(box[i, 2], box[i, 3]):
+            for x in range(box[i, 0], box[i, 1]):
                 group = y * columns + x
                 gaussian[fill[group]] = i
                 fill[group] += 1

@@ -44,6 +44,8 @@ from .simd import (
 )
 
 TILE = 16
+GROUP = 2  # tiles along a side of a group, which share one list of Gaussians
+GROUP_PIXELS = GROUP * TILE
 BLOCKS, BANDS = 16, 8  # blocks of a tile, and of a half of it
 CHANNELS = 4  # red, green, blue, depth
 ALPHA_CUT = 1 / 255
@@ -141,7 +143,7 @@ def _offsets_y(builder: Any, gaussian: _Gaussian, band: Any) -> list[Any]:
 
 
 def _raw_alpha(builder: Any, gaussian: _Gaussian, dx: Lanes, dy: Any) -> tuple[Lanes, Any]:
-    """2^e of eight pixels, and where it is not cut."""
+    """2^e of eight pixels, and where it is not cut: elsewhere the value may be anything."""
     slope = builder.fmul(gaussian.scalar(ROW_B), dy)
     level = builder.fadd(
         builder.fmul(builder.fmul(gaussian.scalar(ROW_C), dy), dy, flags=("fast",)),
@@ -149,7 +151,7 @@ def _raw_alpha(builder: Any, gaussian: _Gaussian, dx: Lanes, dy: Any) -> tuple[L
         flags=("fast",),
     )
     e = (dx * gaussian.scalar(ROW_A) + slope) * dx + level
-    return exp2(e.at_least(2 * LOG2_CUT)), e.above(LOG2_CUT)
+    return exp2(e), e.above(LOG2_CUT)
 
 
 def _pass(transmittance: Lanes, alpha: Lanes) -> tuple[Lanes, Lanes, Any]:
@@ -260,7 +262,7 @@ def _each_bit(builder: Any, bits: Any) -> Iterator[Any]:
 
 @intrinsic
 def blend_backward(typing, tile, gaussians, number, blocks, sums, pair):
-    """Repeat ``blend_forward`` for one Gaussian and write its loss gradients, summed over the blocks, to ``sums[pair]``.
+    """Repeat ``blend_forward`` for one Gaussian; its loss gradients, summed over the blocks, go to ``sums[pair]``.
 
     The plane ``behind`` starts as grad · final colour - T_end · grad_alpha and loses each Gaussian's own
     part, so that d loss / d alpha = T (grad · f) - behind / (1 - alpha) needs no second, back-to-front pass.

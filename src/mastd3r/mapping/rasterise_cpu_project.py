@@ -17,6 +17,7 @@ from numba import njit
 from .rasterise_cpu_blend import (
     ALPHA_CUT,
     CHANNELS,
+    GROUP_PIXELS,
     ROW_A,
     ROW_B,
     ROW_C,
@@ -151,7 +152,7 @@ def _transposed_times(a, f):
 
 @njit(**JIT)
 def _write_row(rows, i, u, v, var_x, cov_xy, var_y, determinant, opacity, spread):
-    """All that blending reads of Gaussian i but its channels; ``spread`` = squared standard deviations to alpha 1/255."""
+    """What blending reads of Gaussian i, but its channels; spread = squared standard deviations to alpha 1/255."""
     rows[i, ROW_X] = u
     rows[i, ROW_Y] = v
     rows[i, ROW_A] = -0.5 * _LOG2_E * var_y / determinant
@@ -167,14 +168,26 @@ def _write_row(rows, i, u, v, var_x, cov_xy, var_y, determinant, opacity, spread
 
 
 @njit(**JIT)
-def project_forward(first, last, means, quats, scales, opacities, colors, view, lens, near, eps2d, rows, depth, radius):
-    """Gaussians first … last-1: rows (N,16) for blending, depth (N,), radius (N,2) of the drawn box, px.
+def _write_box(box, i, u, v, radius_x, radius_y, lens):
+    """Groups of tiles that the drawn box touches: left, right, top, bottom, without the last."""
+    box[i, 0] = max(0.0, math.floor((u - radius_x) / GROUP_PIXELS))
+    box[i, 1] = min(math.ceil(lens[4] / GROUP_PIXELS), math.ceil((u + radius_x) / GROUP_PIXELS))
+    box[i, 2] = max(0.0, math.floor((v - radius_y) / GROUP_PIXELS))
+    box[i, 3] = min(math.ceil(lens[5] / GROUP_PIXELS), math.ceil((v + radius_y) / GROUP_PIXELS))
 
-    Radius 0 = not seen; such a row is not written.
+
+@njit(**JIT)
+def project_forward(
+    first, last, means, quats, scales, opacities, colors, view, lens, near, eps2d, rows, depth, radius, box
+):  # fmt: skip
+    """Gaussians first … last-1: rows (N,16) for blending, depth (N,), radius (N,2) of the drawn box, px, box (N,4).
+
+    Radius 0 and an empty box = not seen; such a row is not written.
     """
     for i in range(first, last):
         radius[i, 0] = 0
         radius[i, 1] = 0
+        box[i, 0] = box[i, 1] = box[i, 2] = box[i, 3] = 0
         x, y, z = _to_camera(view, means, i)
         depth[i] = z
         opacity = float(opacities[i])
@@ -197,6 +210,7 @@ def project_forward(first, last, means, quats, scales, opacities, colors, view, 
             continue
         radius[i, 0] = min(radius_x, 2.0**30)
         radius[i, 1] = min(radius_y, 2.0**30)
+        _write_box(box, i, u, v, radius_x, radius_y, lens)
         _write_row(rows, i, u, v, var_x, cov_xy, var_y, determinant, opacity, spread)
         for channel in range(CHANNELS - 1):
             rows[i, ROW_CHANNEL + channel] = colors[i, channel]
@@ -297,10 +311,10 @@ def _sum_pairs(first, last, pair_gaussian, pair_sums):
 
 @njit(**JIT)
 def _any(sums, row):
+    found = False
     for k in range(SUMS):
-        if sums[row, k] != 0:
-            return True
-    return False
+        found = found or sums[row, k] != 0
+    return found
 
 
 @njit(**JIT)

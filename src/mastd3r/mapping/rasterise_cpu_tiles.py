@@ -6,13 +6,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from .rasterise_cpu_bin import GROUP, GROUP_PIXELS
 from .rasterise_cpu_blend import (
     BANDS,
     BLOCK_BACKWARD,
     BLOCK_FORWARD,
     BLOCKS,
     CHANNELS,
+    GROUP,
+    GROUP_PIXELS,
     PIXELS,
     PLANE_BEHIND,
     PLANE_COLOR,
@@ -32,7 +33,7 @@ from .rasterise_cpu_blend import (
 from .rasterise_cpu_project import JIT
 from .simd import LANES
 
-CHUNK = 32  # Gaussians blended between two looks at which blocks of a tile are opaque
+CHUNK = 16  # Gaussians blended between two looks at which blocks of a tile are opaque
 _F = np.float32
 
 
@@ -104,7 +105,7 @@ def _finish_forward(tile, rows, columns, x0, y0, color, depth, alpha):
 def tiles_forward(first, last, width, height, group_start, group_gaussian, rows, color, depth, alpha, used):
     """Draw groups first … last-1 of tiles: color (h,w,3), depth (h,w), alpha (h,w).
 
-    ``used`` (groups, 16): how many Gaussians of the list came to each tile before it was opaque.
+    ``used`` (groups, 4): how many Gaussians of the list came to each tile before it was opaque.
     """
     tile = np.empty(BLOCKS * BLOCK_FORWARD, np.float32)
     near, number, reached = np.empty((CHUNK, ROW), np.float32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int64)
@@ -125,7 +126,7 @@ def tiles_forward(first, last, width, height, group_start, group_gaussian, rows,
                 used[group, t] += count
                 length[:] = 0
                 for k in range(count):
-                    for block in range(BLOCKS):
+                    for block in range(BLOCKS):  # without a branch: guessing one wrong costs more than this loop
                         listed[block * CHUNK + length[block]] = k
                         length[block] += (reached[k] >> block) & 1
                 for block in range(BLOCKS):

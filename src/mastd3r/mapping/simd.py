@@ -13,6 +13,7 @@ from typing import Any
 from llvmlite import ir
 from numba.core import cgutils
 
+_Order = tuple[int, ...]
 LANES = 8
 FLOAT = ir.FloatType()
 INDEX = ir.IntType(64)
@@ -110,7 +111,7 @@ def lane_numbers(builder: Any) -> Lanes:
 
 
 def exp2(x: Lanes) -> Lanes:
-    """2^x for x in -100 … 0: whole part into the exponent's bits, rest by a polynomial; relative error below 3e-7."""
+    """2^x for x in -126 … 0: whole part into the exponent's bits, rest by a polynomial; relative error below 3e-7."""
     builder = x.builder
     whole = _of_one(x, "rint")
     rest = x - whole
@@ -153,8 +154,9 @@ def store_sums(builder: Any, base: Any, at: Any, vectors: list[Lanes]) -> None:
         group = [_half_sum(v) for v in vectors[first : first + 4]]
         number = len(group)
         group += [ir.Constant(_HALF, [constant(0.0)] * 4)] * (4 - number)
-        pairs = [_add_shuffled(builder, *group[i : i + 2], (0, 4, 1, 5), (2, 6, 3, 7)) for i in (0, 2)]
-        total = _add_shuffled(builder, *pairs, (0, 1, 4, 5), (2, 3, 6, 7))
+        a, b, c, d = group
+        ab, cd = (_add_shuffled(builder, *two, (0, 4, 1, 5), (2, 6, 3, 7)) for two in ((a, b), (c, d)))
+        total = _add_shuffled(builder, ab, cd, (0, 1, 4, 5), (2, 3, 6, 7))
         if number < 4:
             total = _shuffle(builder, total, total, tuple(range(number)))
         place = builder.gep(base, [builder.add(at, index(first))], source_etype=FLOAT)
@@ -166,11 +168,11 @@ def _half_sum(x: Lanes) -> Any:
     return x.builder.fadd(low, high)
 
 
-def _add_shuffled(builder: Any, a: Any, b: Any, one: tuple[int, ...], other: tuple[int, ...]) -> Any:
+def _add_shuffled(builder: Any, a: Any, b: Any, one: _Order, other: _Order) -> Any:
     return builder.fadd(_shuffle(builder, a, b, one), _shuffle(builder, a, b, other))
 
 
-def _shuffle(builder: Any, a: Any, b: Any, lanes: tuple[int, ...]) -> Any:
+def _shuffle(builder: Any, a: Any, b: Any, lanes: _Order) -> Any:
     order = ir.Constant(ir.VectorType(_INT32, len(lanes)), [ir.Constant(_INT32, lane) for lane in lanes])
     return builder.shuffle_vector(a, b, order)
 
