@@ -17,7 +17,7 @@ from mastd3r.mapping.losses import (
     static_weight,
     uncertainty_loss,
 )
-from mastd3r.mapping.ssim import _blur, _blur_torch, ssim_map
+from mastd3r.mapping.ssim import _ssim_torch, ssim_map
 
 STATIC = torch.tensor([[1.0, 0.5, 0.25, 0.0]])
 
@@ -110,9 +110,21 @@ def test_ssim_gradient_is_that_of_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda x: ssim_map(x, b)[4:9, 5:8].sum(), (a,), fast_mode=True)
 
 
-def test_the_two_blurs_agree() -> None:
-    image = np.random.default_rng(3).uniform(0, 1, (20, 30, 3)).astype(np.float32)
-    assert np.allclose(_blur(image), _blur_torch(torch.from_numpy(image)).numpy(), atol=1e-6)
+@pytest.mark.parametrize("size", [(40, 53), (7, 5), (1, 1)])
+def test_the_kernels_of_ssim_are_the_plain_torch_twin(size: tuple[int, int]) -> None:
+    """Values and gradients, float32 kernels against float64 torch, also for images smaller than the window."""
+    generator = torch.Generator().manual_seed(4)
+    image, noise = torch.rand(*size, 3, generator=generator), torch.rand(*size, 3, generator=generator)
+    target, grad = 0.7 * image + 0.3 * noise, torch.rand(*size, generator=generator)
+    ours, theirs = image.clone().requires_grad_(), image.double().requires_grad_()
+    for leaf, function in ((ours, ssim_map), (theirs, _ssim_torch)):
+        value = function(leaf, target.to(leaf))
+        value.backward(grad.to(leaf))
+        if leaf is ours:
+            drawn = value.detach()
+    assert ours.grad is not None and theirs.grad is not None
+    assert (drawn - value.detach()).abs().max() < 1e-5
+    assert (ours.grad - theirs.grad).abs().max() <= 1e-5 * theirs.grad.abs().max()
 
 
 def test_a_moving_thing_does_not_reach_static_pixels_through_the_ssim_window() -> None:
