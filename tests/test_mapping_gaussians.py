@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
 from mastd3r.geometry.sim3 import Sim3
-from mastd3r.mapping.adam import RowAdam
+from mastd3r.mapping.adam import RowAdam, _update_cpu, _update_torch
 from mastd3r.mapping.correction import changes_of
 from mastd3r.mapping.densify import DensifyPolicy, DensifySettings
 from mastd3r.mapping.gaussians import GaussianMap
@@ -155,6 +155,22 @@ def test_transparent_and_veiling_gaussians_are_pruned() -> None:
     assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) == 40
     policy = observed(gaussians, torch.zeros(50), radius=200)
     assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) >= 1  # never an empty map
+
+
+@pytest.mark.parametrize("count", [0, 7, 30_000])
+def test_the_kernel_of_adam_does_what_its_torch_twin_does(count: int) -> None:
+    """The same numbers to rounding, over steps whose gradients differ by orders of magnitude and may be zero."""
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn(count, 3, generator=generator), torch.zeros(count, 3), torch.zeros(count, 3)]
+    ours, theirs = [t.clone() for t in start], [t.clone() for t in start]
+    for step in range(1, 6):
+        grad = torch.randn(count, 3, generator=generator) * 10.0 ** (2 * step - 8)
+        grad[::3] = 0
+        for update, (value, first, second) in ((_update_cpu, ours), (_update_torch, theirs)):
+            update(value, grad, first, second, 0.01 / (1 - 0.9**step), 1 - 0.999**step)
+    for a, b in zip(ours, theirs, strict=True):
+        assert torch.allclose(a, b, rtol=1e-6, atol=1e-7)
+        assert torch.equal(a[::3], b[::3])
 
 
 def test_adam_is_torchs_adam_and_follows_rows() -> None:
