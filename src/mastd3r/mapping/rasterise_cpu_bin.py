@@ -3,12 +3,17 @@
 # mypy: disallow-untyped-defs=False
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
+from ..concurrency import in_blocks
 from .rasterise_cpu_project import JIT
 
 _RADIX_BITS = 11
+_PARTS = 8  # of the order, which are binned at the same time
+_SMALL = 2**16  # Gaussians that one thread bins sooner than several can be told to
 
 
 @njit(**JIT)
@@ -40,20 +45,37 @@ def depth_order(depth, radius):
 
 
 @njit(**JIT)
-def bin_groups(order, box, columns, lines):
+def _count(first, last, order, box, counts):
+    """Parts first … last-1 of the order: counts (parts, lines, columns) of what they put into each group."""
+    parts = len(counts)
+    for part in range(first, last):
+        counts[part] = 0
+        for i in order[part * len(order) // parts : (part + 1) * len(order) // parts]:
+            for y in range(box[i, 2], box[i, 3]):
+                for x in range(box[i, 0], box[i, 1]):
+                    counts[part, y, x] += 1
+
+
+@njit(**JIT)
+def _fill(first, last, order, box, place, gaussian):
+    """Parts first … last-1 of the order; ``place`` (parts, lines, columns): where each part begins in each group."""
+    parts = len(place)
+    for part in range(first, last):
+        for i in order[part * len(order) // parts : (part + 1) * len(order) // parts]:
+            for y in range(box[i, 2], box[i, 3]):
+                for x in range(box[i, 0], box[i, 1]):
+                    gaussian[place[part, y, x]] = i
+                    place[part, y, x] += 1
+
+
+def bin_groups(order: Any, box: Any, columns: int, lines: int) -> tuple[Any, Any]:
     """Lists of Gaussians per group, near to far: start (groups+1,), gaussian (M,). ``box`` as projected."""
-    start = np.zeros(columns * lines + 1, np.int64)
-    for i in range(len(box)):
-        for y in range(box[i, 2], box[i, 3]):
-            for x in range(box[i, 0], box[i, 1]):
-                start[y * columns + x + 1] += 1
-    for group in range(columns * lines):
-        start[group + 1] += start[group]
-    gaussian, fill = np.empty(start[-1], np.int32), start[:-1].copy()
-    for i in order:
-        for y in range(box[i, 2], box[i, 3]):
-            for x in range(box[i, 0], box[i, 1]):
-                group = y * columns + x
-                gaussian[fill[group]] = i
-                fill[group] += 1
-    return start, gaussian
+    counts = np.empty((_PARTS, lines, columns), np.int64)
+    threads = 1 if len(order) < _SMALL else None
+    in_blocks(_count, _PARTS, order, box, counts, threads=threads)
+    by_group = counts.reshape(_PARTS, -1).T
+    end = by_group.cumsum().reshape(by_group.shape)
+    place = np.ascontiguousarray((end - by_group).T).reshape(counts.shape)
+    gaussian = np.empty(end[-1, -1], np.int32)
+    in_blocks(_fill, _PARTS, order, box, place, gaussian, threads=threads)
+    return np.concatenate([np.zeros(1, np.int64), end[:, -1]]), gaussian

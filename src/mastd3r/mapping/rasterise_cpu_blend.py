@@ -13,7 +13,7 @@ For developers: numba's cache on disk watches only the file of a kernel, so afte
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -192,38 +192,59 @@ def ellipse_blocks(typing, rows, gaussian, x, y):
 
 
 @intrinsic
-def blend_forward(typing, tile, block, gaussians, listed, first, count):
+def blend_forward(typing, tile, block, gaussians, listed, first, count, weights):
     """Blend ``count`` Gaussians over one block, front to back: color += T alpha f, T *= 1 - alpha.
 
-    ``listed[first …]`` are their rows in ``gaussians``, whose centres are relative to the tile. Returns whether any
-    pixel of the block is still open.
+    ``listed[first …]`` are their rows in ``gaussians``, whose centres are relative to the tile; ``weights`` (count, 16)
+    is scratch memory. Returns whether any pixel of the block is still open.
     """
-    signature = types.boolean(tile, types.intp, gaussians, listed, types.intp, types.intp)
+    signature = types.boolean(tile, types.intp, gaussians, listed, types.intp, types.intp, weights)
 
     def generate(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        tile_at, rows_at, list_at = (data_pointer(context, builder, sig.args[i], args[i]) for i in (0, 2, 3))
+        arrays = (data_pointer(context, builder, sig.args[i], args[i]) for i in (0, 2, 3, 6))
+        tile_at, rows_at, list_at, weights_at = arrays
         block = _Block(builder, tile_at, args[1], BLOCK_FORWARD)
         half, band = builder.lshr(args[1], index(3)), builder.and_(args[1], index(BANDS - 1))
-        planes = [(plane, row) for plane in range(1 + CHANNELS) for row in range(2)]
-        state = _Slots(builder, len(planes))
-        for number, plane in enumerate(planes):
-            state.put(number, block.load(*plane))
+        transmittance = _Slots(builder, 2)
+        for row in range(2):
+            transmittance.put(row, block.load(PLANE_TRANSMITTANCE, row))
         with cgutils.for_range(builder, args[5]) as loop:
-            place = builder.gep(list_at, [builder.add(args[4], loop.index)], source_etype=ir.IntType(32))
-            number = builder.zext(builder.load(place, typ=ir.IntType(32)), INDEX)
-            gaussian = _Gaussian(builder, rows_at, number)
-            dx, channels = _offset_x(builder, gaussian, half), gaussian.channels()
+            gaussian = _Gaussian(builder, rows_at, _listed(builder, list_at, args[4], loop.index))
+            dx, kept = _offset_x(builder, gaussian, half), _Block(builder, weights_at, loop.index, PIXELS)
             for row, dy in enumerate(_offsets_y(builder, gaussian, band)):
                 raw, seen = _raw_alpha(builder, gaussian, dx, dy)
-                after, weight, _ = _pass(state.get(row), raw.at_most(ALPHA_MAX).where(seen))
-                state.put(row, after)
-                for i, channel in enumerate(channels):
-                    state.add(2 * (1 + i) + row, weight * channel)
-        for number, plane in enumerate(planes):
-            block.store(*plane, state.get(number))
-        return _any_open(builder, [state.get(0), state.get(1)])
+                after, weight, _ = _pass(transmittance.get(row), raw.at_most(ALPHA_MAX).where(seen))
+                transmittance.put(row, after)
+                kept.store(0, row, weight)
+        for row in range(2):
+            block.store(PLANE_TRANSMITTANCE, row, transmittance.get(row))
+        _add_colors(builder, block, rows_at, weights_at, lambda k: _listed(builder, list_at, args[4], k), args[5])
+        return _any_open(builder, [transmittance.get(0), transmittance.get(1)])
 
     return signature, generate
+
+
+def _listed(builder: Any, listed: Any, first: Any, number: Any) -> Any:
+    place = builder.gep(listed, [builder.add(first, number)], source_etype=ir.IntType(32))
+    return builder.zext(builder.load(place, typ=ir.IntType(32)), INDEX)
+
+
+def _add_colors(
+    builder: Any, block: _Block, rows_at: Any, weights_at: Any, listed: Callable[[Any], Any], count: Any
+) -> None:
+    """The channels, in a loop of their own: so the sums of both loops stay in registers."""
+    planes = [(PLANE_COLOR + i, row) for i in range(CHANNELS) for row in range(2)]
+    color = _Slots(builder, len(planes))
+    for number, plane in enumerate(planes):
+        color.put(number, block.load(*plane))
+    with cgutils.for_range(builder, count) as loop:
+        kept = _Block(builder, weights_at, loop.index, PIXELS)
+        weights = [kept.load(0, row) for row in range(2)]
+        for i, channel in enumerate(_Gaussian(builder, rows_at, listed(loop.index)).channels()):
+            for row in range(2):
+                color.add(2 * i + row, weights[row] * channel)
+    for number, plane in enumerate(planes):
+        block.store(*plane, color.get(number))
 
 
 def _any_open(builder: Any, transmittance: list[Lanes]) -> Any:

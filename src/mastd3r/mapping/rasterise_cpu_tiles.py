@@ -33,7 +33,9 @@ from .rasterise_cpu_blend import (
 from .rasterise_cpu_project import JIT
 from .simd import LANES
 
-CHUNK = 16  # Gaussians blended between two looks at which blocks of a tile are opaque
+# Gaussians blended between two looks at which blocks of a tile are opaque. Backward looks more often, because there a
+# Gaussian costs more; so it meets no Gaussian that forward did not count.
+CHUNK, CHUNK_BACKWARD = 32, 16
 _F = np.float32
 
 
@@ -41,10 +43,10 @@ _F = np.float32
 def _next_chunk(at, end, group_gaussian, rows, x0, y0, blocks, near, number, reached):
     """The next Gaussians of a group's list that reach ``blocks`` of the tile at x0, y0: how many, and where it goes on.
 
-    Their rows go to ``near`` (CHUNK,16), centres relative to the tile, their numbers and blocks to the other two.
+    Their rows go to ``near`` (n,16), centres relative to the tile, their numbers and blocks to the other two (n,).
     """
     count = 0
-    while at < end and count < CHUNK:
+    while at < end and count < len(number):
         g = group_gaussian[at]
         at += 1
         x, y = _F(rows[g, ROW_X] - _F(x0) - _F(0.5)), _F(rows[g, ROW_Y] - _F(y0) - _F(0.5))
@@ -110,6 +112,7 @@ def tiles_forward(first, last, width, height, group_start, group_gaussian, rows,
     tile = np.empty(BLOCKS * BLOCK_FORWARD, np.float32)
     near, number, reached = np.empty((CHUNK, ROW), np.float32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int64)
     listed, length = np.empty(BLOCKS * CHUNK, np.int32), np.empty(BLOCKS, np.int64)
+    weights = np.empty((CHUNK, PIXELS), np.float32)
     across = (width + GROUP_PIXELS - 1) // GROUP_PIXELS
     for group in range(first, last):
         for t in range(GROUP * GROUP):
@@ -130,7 +133,8 @@ def tiles_forward(first, last, width, height, group_start, group_gaussian, rows,
                         listed[block * CHUNK + length[block]] = k
                         length[block] += (reached[k] >> block) & 1
                 for block in range(BLOCKS):
-                    if length[block] and not blend_forward(tile, block, near, listed, block * CHUNK, length[block]):
+                    lines = near, listed, block * CHUNK, length[block], weights
+                    if length[block] and not blend_forward(tile, block, *lines):
                         blocks &= ~(1 << block)
             _finish_forward(tile, *inside, x0, y0, color, depth, alpha)
 
@@ -167,7 +171,8 @@ def tiles_backward(
     colour, depth and alpha as drawn, ``grads`` = the loss gradients of the three.
     """
     tile = np.empty(BLOCKS * BLOCK_BACKWARD, np.float32)
-    near, number, reached = np.empty((CHUNK, ROW), np.float32), np.empty(CHUNK, np.int32), np.empty(CHUNK, np.int64)
+    near, number = np.empty((CHUNK_BACKWARD, ROW), np.float32), np.empty(CHUNK_BACKWARD, np.int32)
+    reached = np.empty(CHUNK_BACKWARD, np.int64)
     across = (width + GROUP_PIXELS - 1) // GROUP_PIXELS
     for group in range(first, last):
         for t in range(GROUP * GROUP):
