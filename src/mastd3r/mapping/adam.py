@@ -8,7 +8,7 @@ import torch
 from numba import njit
 
 from ..concurrency import in_blocks
-from .rasterise_cpu_project import JIT
+from .rasterise_cpu_matrices import JIT
 
 _Tensor = torch.Tensor
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from ..concurrency import in_blocks
-from .rasterise_cpu_project import JIT
+from .rasterise_cpu_matrices import JIT
 
 _RADIX_BITS = 11
 _PARTS = 8  # of the order, which are binned at the same time

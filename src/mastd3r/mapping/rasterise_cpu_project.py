@@ -33,14 +33,8 @@ from .rasterise_cpu_blend import (
     ROW_Y,
     SUMS,
 )
+from .rasterise_cpu_matrices import JIT, scaled_columns, times, times_transposed, transposed_times
 
-JIT: dict[str, Any] = {
-    "fastmath": True,
-    "cache": True,
-    "nogil": True,
-    "error_model": "numpy",
-    "boundscheck": False,
-}
 FIELD_MARGIN = 0.15  # the Jacobian is taken at most this share of the width outside the image
 _LOG2_E = 1 / math.log(2)
 _WIDER = 1 + 1e-5  # share by which the square of an ellipse's width is taken larger, against rounding at its tips
@@ -78,11 +72,6 @@ def _rotation(w, x, y, z):
 
 
 @njit(**JIT)
-def _scaled_columns(r, s0, s1, s2):
-    return (r[0] * s0, r[1] * s1, r[2] * s2, r[3] * s0, r[4] * s1, r[5] * s2, r[6] * s0, r[7] * s1, r[8] * s2)
-
-
-@njit(**JIT)
 def _slopes(x, y, z, lens):
     """Entries of the projection's Jacobian, the clamped x and y, and whether they are not clamped."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
@@ -105,48 +94,6 @@ def _jacobian_times_view(j00, j02, j11, j12, view):
         j11 * view[1, 0] + j12 * view[2, 0],
         j11 * view[1, 1] + j12 * view[2, 1],
         j11 * view[1, 2] + j12 * view[2, 2],
-    )
-
-
-@njit(**JIT)
-def _times(a, m):
-    """(2 x 3) (3 x 3)."""
-    return (
-        a[0] * m[0] + a[1] * m[3] + a[2] * m[6],
-        a[0] * m[1] + a[1] * m[4] + a[2] * m[7],
-        a[0] * m[2] + a[1] * m[5] + a[2] * m[8],
-        a[3] * m[0] + a[4] * m[3] + a[5] * m[6],
-        a[3] * m[1] + a[4] * m[4] + a[5] * m[7],
-        a[3] * m[2] + a[4] * m[5] + a[5] * m[8],
-    )
-
-
-@njit(**JIT)
-def _times_transposed(a, m):
-    """(2 x 3) (3 x 3)^T."""
-    return (
-        a[0] * m[0] + a[1] * m[1] + a[2] * m[2],
-        a[0] * m[3] + a[1] * m[4] + a[2] * m[5],
-        a[0] * m[6] + a[1] * m[7] + a[2] * m[8],
-        a[3] * m[0] + a[4] * m[1] + a[5] * m[2],
-        a[3] * m[3] + a[4] * m[4] + a[5] * m[5],
-        a[3] * m[6] + a[4] * m[7] + a[5] * m[8],
-    )
-
-
-@njit(**JIT)
-def _transposed_times(a, f):
-    """(2 x 3)^T (2 x 3)."""
-    return (
-        a[0] * f[0] + a[3] * f[3],
-        a[0] * f[1] + a[3] * f[4],
-        a[0] * f[2] + a[3] * f[5],
-        a[1] * f[0] + a[4] * f[3],
-        a[1] * f[1] + a[4] * f[4],
-        a[1] * f[2] + a[4] * f[5],
-        a[2] * f[0] + a[5] * f[3],
-        a[2] * f[1] + a[5] * f[4],
-        a[2] * f[2] + a[5] * f[5],
     )
 
 
@@ -194,9 +141,9 @@ def project_forward(
         if not (z > near and opacity >= ALPHA_CUT):
             continue
         w, qx, qy, qz, _ = _unit_quaternion(quats, i)
-        shape = _scaled_columns(_rotation(w, qx, qy, qz), scales[i, 0], scales[i, 1], scales[i, 2])
+        shape = scaled_columns(_rotation(w, qx, qy, qz), scales[i, 0], scales[i, 1], scales[i, 2])
         j00, j02, j11, j12, _, _, _, _ = _slopes(x, y, z, lens)
-        b = _times(_jacobian_times_view(j00, j02, j11, j12, view), shape)
+        b = times(_jacobian_times_view(j00, j02, j11, j12, view), shape)
         var_x = b[0] * b[0] + b[1] * b[1] + b[2] * b[2] + eps2d
         cov_xy = b[0] * b[3] + b[1] * b[4] + b[2] * b[5]
         var_y = b[3] * b[3] + b[4] * b[4] + b[5] * b[5] + eps2d
@@ -368,10 +315,10 @@ def _chain(i, sums, row, means, quats, scales, opacities, view, lens, rows, outp
     w, qx, qy, qz, inverse_norm = _unit_quaternion(quats, i)
     r = _rotation(w, qx, qy, qz)
     s0, s1, s2 = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
-    shape = _scaled_columns(r, s0, s1, s2)
+    shape = scaled_columns(r, s0, s1, s2)
     slopes = _slopes(x, y, z, lens)
     a = _jacobian_times_view(slopes[0], slopes[1], slopes[2], slopes[3], view)
-    b = _times(a, shape)
+    b = times(a, shape)
     conic, pixel, conic_grad, opacity_grad[i] = _screen_grads(rows, opacities, sums, i, row)
     e00, e01, e11 = _covariance_grad(conic, conic_grad)  # cov = b b^T + eps
     f = (
@@ -382,11 +329,11 @@ def _chain(i, sums, row, means, quats, scales, opacities, view, lens, rows, outp
         2 * (e01 * b[1] + e11 * b[4]),
         2 * (e01 * b[2] + e11 * b[5]),
     )
-    m = _transposed_times(a, f)
-    product_grad = _times_transposed(f, shape)
+    m = transposed_times(a, f)
+    product_grad = times_transposed(f, shape)
     point = _point_grad(x, y, z, lens, slopes, pixel, float(sums[row, 9]), _jacobian_grad(product_grad, view))
     _add_view_grad(view_grad, chunk, slopes, product_grad, point, means, i)
-    turn = _quaternion_grad(w, qx, qy, qz, inverse_norm, _scaled_columns(m, s0, s1, s2))
+    turn = _quaternion_grad(w, qx, qy, qz, inverse_norm, scaled_columns(m, s0, s1, s2))
     for k in range(4):
         quat_grad[i, k] = turn[k]
     for k in range(3):

@@ -30,7 +30,7 @@ from .rasterise_cpu_blend import (
     block_open,
     ellipse_blocks,
 )
-from .rasterise_cpu_project import JIT
+from .rasterise_cpu_matrices import JIT
 from .simd import LANES
 
 # Gaussians blended between two looks at which blocks of a tile are opaque. Backward looks more often, because there a

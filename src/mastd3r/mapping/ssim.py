@@ -10,7 +10,7 @@ import torch
 from numba import njit
 
 from ..concurrency import in_blocks
-from .rasterise_cpu_project import JIT
+from .rasterise_cpu_matrices import JIT
 
 _SIGMA, _SIZE = 1.5, 11
 _HALF, _CHANNELS = _SIZE // 2, 3
