@@ -38,7 +38,7 @@ def news(kf: int, steps: int = 4, points: int = 80) -> KeyframeNews:
         np.full(points, 0.1, np.float32),
         np.full(points, kf, np.int32),
     )
-    image, static = np.full((48, 64, 3), 0.5, np.float32), np.ones((48, 64), np.float32)
+    image, static = np.full((48, 64, 3), 128, np.uint8), np.ones((48, 64), np.float32)
     return KeyframeNews(View(float(kf), image, static, shifted(0.1 * kf), CAMERA, kf), cloud, shifted(0.1 * kf), steps)
 
 
@@ -74,7 +74,7 @@ def test_a_correction_moves_the_map_once(bends: bool) -> None:
     moved = after.means[:, 0] - before.means[:, 0]
     if bends:
         assert moved.min() >= 0 and moved.max() < 0.05
-        assert np.median(moved) == pytest.approx(0.05 / 3, rel=0.1)
+        assert np.median(moved) == pytest.approx(0.05 / 3, rel=0.15)
     else:
         np.testing.assert_allclose(moved, 0.05, atol=1e-5)
 

@@ -110,7 +110,7 @@ def test_a_correction_with_scale_scales_the_gaussians() -> None:
 
 
 def observed(gaussians: GaussianMap, grad: torch.Tensor, radius: int, **settings: float) -> DensifyPolicy:
-    policy = DensifyPolicy(260, 1000, 0, DensifySettings(**settings))  # type: ignore[arg-type]
+    policy = DensifyPolicy(260, 0, DensifySettings(**settings))  # type: ignore[arg-type]
     size = torch.full((len(gaussians), 2), radius, dtype=torch.int32)
     policy.observe(gaussians, ScreenStats(size, torch.stack([grad, torch.zeros_like(grad)], 1)), 64)
     return policy
@@ -120,16 +120,21 @@ def test_growth_takes_the_largest_gradients_and_respects_the_limit() -> None:
     gaussians = random_map(200)
     grad = torch.linspace(0, 1, 200)
     policy = observed(gaussians, grad, radius=3)
-    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64, 0.6)
     assert len(after) == 260
     assert torch.equal(after.means[200:].detach().sort(0)[0], gaussians.means[140:].detach().sort(0)[0])
     assert torch.equal(after.kf_id[200:].sort()[0], gaussians.kf_id[140:].sort()[0])
 
 
+def test_the_number_of_gaussians_grows_with_the_training() -> None:
+    policy = DensifyPolicy(1000, 0, DensifySettings(start_ratio=0.1, full_ratio=0.5))
+    assert [policy.allowed(200, done) for done in (0.1, 0.3, 0.5, 0.7)] == [200, 600, 1000, 1000]
+
+
 def test_clones_hide_as_much_as_their_parent() -> None:
     gaussians = random_map(5)
     policy = observed(gaussians, torch.tensor([0.0, 0, 9, 0, 0]), radius=3)
-    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64, 0.6)
     parent, child = after.opacity_logits[[2, 5]].detach().sigmoid()
     assert float(1 - (1 - parent) * (1 - child)) == pytest.approx(
         float(gaussians.opacity_logits[2].detach().sigmoid()), abs=1e-5
@@ -139,7 +144,7 @@ def test_clones_hide_as_much_as_their_parent() -> None:
 def test_large_gaussians_are_split_and_shrink() -> None:
     gaussians = random_map(5)
     policy = observed(gaussians, torch.tensor([0.0, 0, 9, 0, 0]), radius=15)
-    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64)
+    after = policy.round(gaussians, RowAdam(gaussians.parameters()), 64, 0.6)
     assert len(after) == 6
     for row in (2, 5):
         assert torch.all(after.log_scales[row] < gaussians.log_scales[2])
@@ -152,9 +157,9 @@ def test_transparent_and_veiling_gaussians_are_pruned() -> None:
     with torch.no_grad():
         gaussians.opacity_logits[:10] = -6
     policy = observed(gaussians, torch.zeros(50), radius=3)
-    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) == 40
+    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64, 0.6)) == 40
     policy = observed(gaussians, torch.zeros(50), radius=200)
-    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64)) >= 1  # never an empty map
+    assert len(policy.round(gaussians, RowAdam(gaussians.parameters()), 64, 0.6)) >= 1  # never an empty map
 
 
 @pytest.mark.parametrize("count", [0, 7, 30_000])

@@ -30,6 +30,7 @@ PlacesKind = Annotated[str, PLACES]
 CorrectionKind = Annotated[str, ALIGNMENT]
 MapBackendKind = Annotated[str, MAP_BACKENDS]
 MapLossKind = Literal["plain", "mask", "uncertainty", "full"]
+MapQualityKind = Literal["draft", "standard", "high"]
 SourceKind = Literal[
     "auto", "video", "images", "tum", "bonn", "kitti-raw", "kitti-odometry", "7scenes", "euroc", "replica"
 ]  # fmt: skip
@@ -105,10 +106,13 @@ class MappingConfig:
     device: MapDeviceKind = "auto"  # auto: the accelerator where gsplat draws on it, the CPU otherwise
     backend: MapBackendKind = "auto"  # what draws the Gaussians; auto: gsplat on an accelerator, numba on the CPU
     loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
-    width_px: int = 320  # width of the images that the map is trained on and rendered at
-    iterations: int = 3000  # optimisation steps, one view each
+    quality: MapQualityKind = "standard"  # decides whatever of the next four is not given, by the device
+    width_px: int = 0  # width of the images that the map is trained on and rendered at; 0: by the quality
+    iterations: int | None = None  # optimisation steps, one view each; None: by the quality
+    max_gaussians: int = 0  # 0: by the quality
+    sh_degree: int | None = None  # 0 to 3: spherical harmonics, colour by direction of view; None: by the quality
+    minutes: float = 0.0  # for the training, instead of a number of steps; 0: as many steps as said
     max_views: int = 160  # training views kept in memory
-    max_gaussians: int = 60000
     dynamic_weight: float = 0.05  # beta of eq. (14)
     hard_weight: bool = False  # True: eq. (14) as printed; False: w = 1 - 0.95 p
     tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
@@ -116,10 +120,9 @@ class MappingConfig:
     paper_loss: bool = False  # True: squared error with the weights as printed; False: L1 + 0.2 D-SSIM
     ssim_share: float = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
     exposure: bool = True  # a gain and a bias a colour channel for every training view
-    sh_degree: int = 0  # 0 to 3: spherical harmonics, colour that depends on the direction of view
     realtime: bool = False  # start the map while tracking runs, in a process of its own
     realtime_steps: int = 4  # optimisation steps a frame that it may spend meanwhile
-    refine_poses: bool = True  # move the training cameras through the render gradient
+    refine_poses: bool = False  # move the training cameras too; then every frame is placed in the map
 
 
 @dataclass(frozen=True)

@@ -125,12 +125,12 @@ class View:
     """One photograph for the Gaussian map: pinhole (undistorted), with its soft static weight."""
 
     timestamp_s: float
-    image: Array  # (h, w, 3) float32 0..1 RGB
-    static: Array  # (h, w) float32, 1 - P(moving); 0 where the undistorted image has no data
+    image: Array  # (h, w, 3) uint8 RGB
+    static: Array  # (h, w) float16 or float32, 1 - P(moving); 0 where the undistorted image has no data
     world_from_cam: Array  # (4, 4) float64
     camera: Camera  # at (h, w), k1 == 0
     kf_id: int  # keyframe that this view hangs on
-    uncertainty: Array | None = None  # (h, w) float32 u(p) of eq. (16), 0 outside R
+    uncertainty: Array | None = None  # (h, w) float16 or float32 u(p) of eq. (16), 0 outside R
 
 
 @dataclass(frozen=True)

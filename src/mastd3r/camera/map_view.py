@@ -33,10 +33,10 @@ class MapView:
         self._from_pinhole = self.pinhole.project(self.camera.rays(self.camera.pixel_grid())).astype(np.float32)
 
     def pinhole_image(self, image: Array) -> tuple[Array, Array]:
-        """(h, w, 3) float32 0..1 pinhole image of a full-size uint8 photograph, and (h, w) 1 where it has data."""
+        """(h, w, 3) uint8 pinhole image of a full-size uint8 photograph, and (h, w) 1 where it has data."""
         size = (self.camera.width, self.camera.height)
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255
-        return self._warped(small, self._from_photo, cv2.INTER_CUBIC).clip(0, 1), self._inside
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return self._warped(small, self._from_photo, cv2.INTER_CUBIC), self._inside
 
     def pinhole_map(self, values: Array) -> Array:
         """(h, w) float32 pinhole view of a map over the photograph at any size."""

@@ -18,7 +18,8 @@ class DensifySettings:
 
     every: int = 100  # steps between two rounds
     start_ratio: float = 0.05
-    stop_ratio: float = 0.6
+    stop_ratio: float = 0.7
+    full_ratio: float = 0.5  # of the schedule: from here on there may be as many Gaussians as the limit
     grad_threshold: float = 2e-4  # mean |d loss / d mean| in units of half an image width
     split_sigma_px: float = 3.0  # larger Gaussians are split in two, smaller ones are cloned
     prune_opacity: float = 0.02
@@ -28,9 +29,10 @@ class DensifySettings:
 class DensifyPolicy:
     """Collects screen gradients and, in rounds, clones, splits and prunes."""
 
-    def __init__(self, max_gaussians: int, iterations: int, seed: int, settings: DensifySettings) -> None:
-        self.settings, self._limit, self._iterations = settings, max_gaussians, iterations
+    def __init__(self, max_gaussians: int, seed: int, settings: DensifySettings) -> None:
+        self.settings, self._limit = settings, max_gaussians
         self._generator = torch.Generator().manual_seed(seed)
+        self._first: int | None = None  # Gaussians at the first round
         self._reset(0)
 
     def _reset(self, count: int, device: torch.device | None = None) -> None:
@@ -49,15 +51,23 @@ class DensifyPolicy:
         self._seen += radius > 0
         self._sigma_px = torch.maximum(self._sigma_px, radius / 3.0)
 
-    def due(self, step: int) -> bool:
-        """True where a round follows step ``step`` (counted from 1)."""
-        done = step / max(1, self._iterations)
+    def due(self, step: int, done: float) -> bool:
+        """True where a round follows step ``step`` (counted from 1), with a share ``done`` of the training behind."""
+        return step % self.settings.every == 0 and self.settings.start_ratio <= done <= self.settings.stop_ratio
+
+    def allowed(self, count: int, done: float) -> int:
+        """How many Gaussians there may be: from ``count`` at the first round to the limit."""
         s = self.settings
-        return step % s.every == 0 and s.start_ratio <= done <= s.stop_ratio
+        self._first = count if self._first is None else self._first
+        ramp = (done - s.start_ratio) / max(s.full_ratio - s.start_ratio, 1e-9)
+        return int(self._first + (self._limit - self._first) * min(1.0, max(0.0, ramp)))
 
     @torch.no_grad()
-    def round(self, gaussians: GaussianMap, adam: RowAdam, width: int) -> GaussianMap:
-        """One round of pruning and growth; returns the new map and keeps ``adam`` in step with it."""
+    def round(self, gaussians: GaussianMap, adam: RowAdam, width: int, done: float) -> GaussianMap:
+        """One round of pruning and growth; returns the new map and keeps ``adam`` in step with it.
+
+        What is pruned makes room, and the room goes where the loss pulls hardest.
+        """
         s = self.settings
         opacity = gaussians.opacity_logits.sigmoid()
         keep = (opacity > s.prune_opacity) & (self._sigma_px < s.prune_width_ratio * width)
@@ -66,7 +76,7 @@ class DensifyPolicy:
             keep = opacity >= opacity.max()
         grad = self._grad_sum / self._seen.clamp_min(1)
         wants = torch.nonzero(keep & (grad > s.grad_threshold))[:, 0]
-        room = max(0, self._limit - int(keep.sum()))
+        room = max(0, self.allowed(len(gaussians), done) - int(keep.sum()))
         grown = wants[torch.argsort(-grad[wants], stable=True)[:room]]
         rows = torch.cat([torch.nonzero(keep)[:, 0], grown])
         fresh = torch.zeros(len(rows), dtype=torch.bool, device=rows.device)

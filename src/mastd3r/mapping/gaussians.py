@@ -130,6 +130,12 @@ class GaussianMap:
         tensors = zip(names, (means, quats, log_scales, sh_rest), strict=True)
         return replace(self, **{name: t.requires_grad_() for name, t in tensors})
 
+    def exposed(self, gain: Array, bias: Array) -> GaussianMap:
+        """The map with every colour times ``gain`` (3,) plus ``bias`` (3,), cut to 0..1."""
+        g, b = (torch.from_numpy(np.asarray(v, np.float32)).to(self.colors) for v in (gain, bias))
+        colors, sh_rest = (self.colors.detach() * g + b).clamp(0, 1), self.sh_rest.detach() * g
+        return replace(self, colors=colors.requires_grad_(), sh_rest=sh_rest.requires_grad_())
+
     def arrays(self) -> GaussianArrays:
         """Plain numpy arrays for export."""
         with torch.no_grad():

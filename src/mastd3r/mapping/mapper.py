@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+import cv2
 import numpy as np
 import torch
 
@@ -18,12 +20,18 @@ from ..geometry.sim3 import Sim3
 from ..types import StaticCloud, View
 from .adam import RowAdam
 from .correction import Visibility, changes_of, deformation, fitted_pose, followed, visibility
+from .coverage import gaps_filled
 from .densify import DensifyPolicy, DensifySettings
 from .gaussians import Array, GaussianArrays, GaussianMap
-from .losses import mask_loss, photometric_loss, pixel_weight, squared_color_error
+from .losses import mask_loss, photometric_loss, squared_color_error
+from .placing import placed
+from .quality import resolved
+from .sampling import Sampling, sampled
+from .schedule import Pace
 from .screen import ScreenStats
 from .seed import seed_gaussians
 from .splat import as_pictures
+from .targets import Targets, shrunk
 from .view_parameters import ViewParameters
 
 T = TypeVar("T")
@@ -42,8 +50,12 @@ class TrainingRates:
     sh_rest: float = 1e-3
 
 
-SEED_SHARE = 0.6  # of max_gaussians, so that densification has room
+SEED_SHARE = 0.3  # of max_gaussians, so that densification has room
 DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaussians move by their anchor
+SH_FROM = 0.4  # of the training; before that, colours do not depend on the direction
+NEAR_RATIO = 1e-3  # of the median depth: nearer than that no viewer draws
+LEAST_SIGMA_PX = 0.2  # standard deviation of the smallest Gaussian, in pixels of the view that sees it largest
+PLACE_PX = 320  # width of the pictures that training views are placed by
 MAX_VISIBILITIES = 48  # views that are drawn to see which keyframes a Gaussian follows
 
 
@@ -71,21 +83,25 @@ class Mapper:
         """
         check_map_options(config)
         self._views = _evenly(_checked_views(views), config.max_views)
+        camera = self._views[0].camera
+        config = resolved(config, (camera.width, camera.height), device)
         self.config, self._rates, self._device = config, rates or TrainingRates(), device
         self._seeds, self._seed = max(1, int(config.max_gaussians * SEED_SHARE)), seed
         if start is not None:
             self._map = GaussianMap.from_arrays(start, device)
         else:
-            self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree)
+            self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree or 0)
         self._map.backend = config.backend
         self._adam = RowAdam(self._map.parameters())
-        self._policy = DensifyPolicy(config.max_gaussians, config.iterations, seed, densify or DensifySettings())
+        self._policy = DensifyPolicy(config.max_gaussians, seed, densify or DensifySettings())
         self._depth, self._near = _depths(self._map, self._views)
         self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, config.exposure)
-        self._background = _mean_color(self._views).to(device)
+        self._targets = Targets(config, device)
         self._order = _view_order(len(self._views), seed)
-        self._targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
-        self._step = steps_done
+        self._backgrounds = torch.Generator().manual_seed(seed)
+        self._pace = Pace(camera.width, config.iterations or 0, steps_done)
+        if start is None:
+            self._fill_gaps()
 
     @property
     def gaussians(self) -> GaussianArrays:
@@ -95,40 +111,72 @@ class Mapper:
     @property
     def facts(self) -> dict[str, Any]:
         """What is not in gaussians.ply and decides how the map looks."""
-        return {"near": self._near, "background": self._background.tolist(), "median_depth": self._depth}
+        return {"near": self._near, "median_depth": self._depth}
 
     def refine(self, steps: int, on_step: Callable[[int, float], None] | None = None) -> None:
         """Run ``steps`` optimisation steps, one view each; ``on_step(step, loss)`` counts from 1.
 
-        The schedule of rates and densification is that of ``config.iterations`` steps in all.
+        The schedule of sizes, rates and densification is that of ``config.iterations`` steps in all.
         """
         with one_torch_thread():
             for _ in range(steps):
-                self._step += 1
-                loss = self._one_step(next(self._order))
-                if on_step is not None:
-                    on_step(self._step, loss)
+                self._step(on_step)
 
-    def render(
-        self, world_from_cam: Array, camera: Camera, timestamp_s: float | None = None
-    ) -> tuple[Array, Array, Array]:
-        """Colour (h,w,3) float32 0..1, depth (h,w) in map units (0 where nothing is), alpha (h,w).
+    def refine_for(self, seconds: float, on_step: Callable[[int, float], None] | None = None) -> None:
+        """What is left of the schedule in so many seconds, however many steps that are on this machine."""
+        width, before = self._views[0].camera.width, self._pace.steps
+        self._pace = Pace(width, self.config.iterations or 0, before, seconds)
+        with one_torch_thread():
+            while self._pace.done < 1:
+                self._step(on_step)
 
-        With ``timestamp_s`` the exposure (and the pose correction, where poses are refined) is interpolated
-        between the training views around it, else the exposure is neutral and the pose as given.
-        """
+    def _step(self, on_step: Callable[[int, float], None] | None) -> None:
+        self._pace.steps += 1
+        loss = self._one_step(next(self._order))
+        if on_step is not None:
+            on_step(self._pace.steps, loss)
+
+    def render(self, world_from_cam: Array, camera: Camera) -> tuple[Array, Array, Array]:
+        """Colour (h,w,3) float32 0..1 over black, depth (h,w) in map units (0 where nothing is), alpha (h,w)."""
         cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))
         K = torch.from_numpy(camera.matrix).to(self._device)
         with torch.no_grad():
-            if timestamp_s is not None:
-                cam_from_world = self._view_parameters.corrected_at(cam_from_world, timestamp_s)
-            color, depth, alpha = self._draw(cam_from_world, K, camera.width, camera.height, None)
-            if timestamp_s is not None:
-                color = self._view_parameters.exposed_at(color, timestamp_s)
-        return as_pictures(color, depth, alpha)
+            drawn = self._draw(cam_from_world, K, camera.width, camera.height, None)
+        return as_pictures(*drawn)
+
+    def refined_pose(self, world_from_cam: Array, timestamp_s: float) -> Array:
+        """A tracked pose (4, 4) under the corrections that the training views around it have learned."""
+        cam_from_world = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))
+        with torch.no_grad():
+            return np.linalg.inv(self._view_parameters.corrected_at(cam_from_world, timestamp_s).numpy())
+
+    def place_views(self) -> int:
+        """Read every training view's pose off the map as it is now (``placing.py``); gives how many could be placed."""
+        count = 0
+        for number, view in enumerate(self._views):
+            camera = shrunk(view.camera, max(1, round(view.camera.width / PLACE_PX)))
+            target, weight = self._targets.get(number, view, max(1, round(view.camera.width / PLACE_PX)))
+            pose = self._view_parameters.cam_from_world(number).detach()
+            K = torch.from_numpy(camera.matrix).to(self._device)
+            with torch.no_grad():
+                color, depth, alpha = as_pictures(*self._draw(pose, K, camera.width, camera.height, None))
+            grey = cv2.cvtColor(target.cpu().numpy(), cv2.COLOR_RGB2GRAY)
+            drawn = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), depth, alpha
+            found = placed(drawn, camera, grey, weight.cpu().numpy(), np.linalg.inv(pose.numpy()))
+            if found.accepted:
+                count += 1
+                self._view_parameters.put(number, inverse(found.world_from_cam))
+        return count
+
+    def settle(self) -> None:
+        """Make the map what its file shows: colours at the mean exposure, nothing right before a camera."""
+        if self.config.exposure:
+            gain, bias = self._view_parameters.centre_exposure()
+            self._map = self._map.exposed(gain, bias)
+        self._clear_and_limit()
 
     def extend(self, views: list[View], cloud: StaticCloud) -> None:
-        """More views (up to ``max_views``), and seeds from more points, up to the share of the limit that seeds have.
+        """More views (up to ``max_views``), and seeds from more points, up to half of what the limit leaves free.
 
         Raises InputError for views of the wrong shape.
         """
@@ -137,9 +185,9 @@ class Mapper:
             self._views = [*self._views, *new]
             self._view_parameters.extend(new)
             self._order = _view_order(len(self._views), self._seed + len(self._views))
-        room = self._seeds - len(self._map)
+        room = max(self._seeds - len(self._map), (self.config.max_gaussians - len(self._map)) // 2)
         if room > 0 and len(cloud.points_world):
-            seeds = seed_gaussians(cloud, room, self._seed, self._device, self.config.sh_degree)
+            seeds = seed_gaussians(cloud, room, self._seed, self._device, self.config.sh_degree or 0)
             self._map = self._map.joined(seeds)
             self._adam.grow(len(seeds))
 
@@ -169,7 +217,7 @@ class Mapper:
     def _sights(self, changes: list[Sim3]) -> Iterator[tuple[int, Visibility]]:
         """What a part of the views sees of the map now; ``changes`` are those of all views' keyframes."""
         for number in _evenly(range(len(self._views)), MAX_VISIBILITIES):
-            view, (_, weight) = self._views[number], self._target(number)
+            view, (_, weight) = self._views[number], self._targets.get(number, self._views[number], 1)
             K = torch.from_numpy(view.camera.matrix).to(self._device)
             pose = self._view_parameters.cam_from_world(number).detach()
             refined = Sim3.from_rigid(inverse(self._view_parameters.tracked_cam_from_world(number)) @ pose.numpy())
@@ -190,6 +238,36 @@ class Mapper:
             found = fitted_pose(transform(pose, old), transform(tracked, new), weight, self._depth)
             self._view_parameters.correct(number, *found)
 
+    def _fill_gaps(self) -> None:
+        """Seeds where the cloud has left the photographs' static pixels open."""
+        numbers = _evenly(range(len(self._views)), MAX_VISIBILITIES)
+        poses = [self._view_parameters.tracked_cam_from_world(n) for n in numbers]
+        room = self.config.max_gaussians - len(self._map)
+        self._map = gaps_filled(self._map, [self._views[n] for n in numbers], poses, self._near, room)
+        self._adam = RowAdam(self._map.parameters())
+
+    def _sampling(self) -> Sampling:
+        numbers = range(len(self._views))
+        poses = [self._view_parameters.cam_from_world(n).detach().numpy() for n in numbers]
+        means = self._map.means.detach().float().cpu().numpy()
+        return sampled(means, [v.camera for v in self._views], poses, self._near)
+
+    def _clear_and_limit(self) -> None:
+        """Remove what stands right before a camera; make nothing finer than the views can tell.
+
+        Floaters love the space before the lens, where hardly another view contradicts them, and what is too fine falls
+        apart when a viewer goes closer.
+        """
+        sampling = self._sampling()
+        pixel, keep = torch.from_numpy(sampling.pixel), torch.from_numpy(np.flatnonzero(~sampling.blocks))
+        if 0 < len(keep) < len(self._map):
+            keep = keep.to(self._device)
+            self._map, pixel = self._map.picked(keep), pixel[keep.cpu()]
+            self._adam.pick(keep, torch.zeros(len(keep), dtype=torch.bool, device=keep.device))
+        least = (LEAST_SIGMA_PX * pixel.to(self._device)).clamp_min(1e-12).log()
+        with torch.no_grad():
+            self._map.log_scales.copy_(torch.maximum(self._map.log_scales, least[:, None]))
+
     def _draw(
         self,
         cam_from_world: torch.Tensor,
@@ -198,66 +276,55 @@ class Mapper:
         height: int,
         stats: ScreenStats | None,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        return self._map.draw(cam_from_world, K, width, height, self._near, self._background, stats)
+        return self._map.draw(cam_from_world, K, width, height, NEAR_RATIO * self._depth, None, stats)
 
     def _one_step(self, number: int) -> float:
-        camera, stats = self._views[number].camera, ScreenStats()
+        """One view, over a background of a colour drawn at random: only an opaque world explains them all."""
+        shrink = self._pace.shrink
+        camera, stats = shrunk(self._views[number].camera, shrink), ScreenStats()
         K = torch.from_numpy(camera.matrix).to(self._device)
         cam_from_world = self._view_parameters.cam_from_world(number)
-        color, _, _ = self._draw(cam_from_world, K, camera.width, camera.height, stats)
-        color = self._view_parameters.exposed(color, number)
-        loss = self._loss(color, number) + self._view_parameters.prior(number).to(color.device)
+        background = torch.rand(3, generator=self._backgrounds).to(self._device)
+        color, _, alpha = self._draw(cam_from_world, K, camera.width, camera.height, stats)
+        color = self._view_parameters.exposed(color, alpha, number) + (1 - alpha)[..., None] * background
+        loss = self._loss(color, number, shrink) + self._view_parameters.prior(number).to(color.device)
         loss.backward()
         self._policy.observe(self._map, stats, camera.width)
         self._adam.step(self._map.parameters(), self._current_rates())
-        self._view_parameters.step(number, self._done_ratio)
-        if self._policy.due(self._step):
-            self._map = self._policy.round(self._map, self._adam, camera.width)
+        self._view_parameters.step(number, self._pace.done)
+        with torch.no_grad():
+            self._map.colors.clamp_(0, 1)  # as the file holds them
+        if self._policy.due(self._pace.steps, self._pace.done):
+            self._map = self._policy.round(self._map, self._adam, camera.width, self._pace.done)
+            self._clear_and_limit()
         return float(loss.detach())
 
-    def _loss(self, color: torch.Tensor, number: int) -> torch.Tensor:
-        target, weight = self._target(number)
+    def _loss(self, color: torch.Tensor, number: int, shrink: int) -> torch.Tensor:
+        target, weight = self._targets.get(number, self._views[number], shrink)
         if self.config.paper_loss:
             return mask_loss(squared_color_error(color, target), weight)
         return photometric_loss(color, target, weight, self.config.ssim_share)
 
-    def _target(self, number: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Photograph and pixel weight of eq. (17) of one view, on the map's device; made once."""
-        if number not in self._targets:
-            c, view = self.config, self._views[number]
-            target, static = self._tensor(view.image), self._tensor(view.static)
-            u = None if view.uncertainty is None else self._tensor(view.uncertainty)
-            weight = pixel_weight(
-                c.loss, static, u, c.dynamic_weight, c.hard_weight, c.lambda_uncertainty, c.paper_loss
-            )
-            self._targets[number] = target, weight
-        return self._targets[number]
-
-    def _tensor(self, array: Array) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array)).to(self._device, torch.float32)
-
-    @property
-    def _done_ratio(self) -> float:
-        return min(1.0, self._step / max(1, self.config.iterations))
-
     def _current_rates(self) -> dict[str, float]:
         r = self._rates
         return {
-            "means": r.means * self._depth * r.means_last_ratio**self._done_ratio,
+            "means": r.means * self._depth * r.means_last_ratio**self._pace.done,
             "log_scales": r.log_scales,
             "quats": r.quats,
             "opacity_logits": r.opacity_logits,
             "colors": r.colors,
-            "sh_rest": r.sh_rest,
+            "sh_rest": r.sh_rest if self._pace.done >= SH_FROM else 0.0,
         }
 
 
 def check_map_options(config: MappingConfig) -> None:
     """Raises ConfigError for options outside their range."""
-    if config.sh_degree not in range(4):
+    if config.sh_degree is not None and config.sh_degree not in range(4):
         raise ConfigError(f"mapping.sh_degree: expected 0 to 3, got {config.sh_degree}")
     if not 0 <= config.ssim_share <= 1:
         raise ConfigError(f"mapping.ssim_share: expected 0 to 1, got {config.ssim_share}")
+    if not 0 <= config.minutes < math.inf:
+        raise ConfigError(f"mapping.minutes: expected a finite number, 0 or more, got {config.minutes}")
 
 
 def _checked_views(views: list[View]) -> list[View]:
@@ -265,10 +332,10 @@ def _checked_views(views: list[View]) -> list[View]:
         raise InputError("Gaussian map: expected at least one training view, got none")
     for view in views:
         size = (view.camera.height, view.camera.width)
-        if view.image.shape != (*size, 3) or view.static.shape != size:
+        if view.image.shape != (*size, 3) or view.image.dtype != np.uint8 or view.static.shape != size:
             raise InputError(
-                f"Gaussian map, view at {view.timestamp_s} s: expected image {(*size, 3)} and static {size}, "
-                f"got {view.image.shape} and {view.static.shape}"
+                f"Gaussian map, view at {view.timestamp_s} s: expected image {(*size, 3)} of bytes and static {size}, "
+                f"got {view.image.shape} of {view.image.dtype} and {view.static.shape}"
             )
     return views
 
@@ -298,14 +365,6 @@ def _depths(gaussians: GaussianMap, views: list[View]) -> tuple[float, float]:
         raise InputError("Gaussian map: expected static points in front of the cameras, got none")
     median = float(np.median(every))
     return median, float(np.clip(0.5 * np.percentile(every, 1), 0.02 * median, 0.25 * median))
-
-
-def _mean_color(views: list[View]) -> torch.Tensor:
-    """What lies behind everything: the mean colour of the photographs' static pixels."""
-    few = views[:: max(1, len(views) // 16)]
-    total = sum(float(v.static.sum()) for v in few)
-    mean = sum((v.image * v.static[..., None]).sum((0, 1), dtype=np.float64) for v in few) / max(total, 1e-9)
-    return torch.from_numpy(np.asarray(mean, np.float32))
 
 
 def _view_order(count: int, seed: int) -> Iterator[int]:

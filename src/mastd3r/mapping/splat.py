@@ -17,7 +17,11 @@ class Splat:
     """Gaussians of a file, what is nearer than ``near`` left out, ``background`` (RGB, 0..1) behind everything."""
 
     def __init__(
-        self, gaussians: GaussianArrays, near: float, background: Sequence[float], device: str = "cpu"
+        self,
+        gaussians: GaussianArrays,
+        near: float,
+        background: Sequence[float] = (0.0, 0.0, 0.0),
+        device: str = "cpu",
     ) -> None:
         self._map, self._near = GaussianMap.from_arrays(gaussians, device), near
         self._background = torch.tensor(list(background), dtype=torch.float32, device=device)
@@ -25,7 +29,7 @@ class Splat:
     def render(self, world_from_cam: Array, camera: Camera) -> tuple[Array, Array, Array]:
         """Colour (h,w,3) float32 0..1, depth (h,w) in map units (0 where nothing is), alpha (h,w)."""
         view = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))
-        K = torch.from_numpy(camera.matrix)
+        K = torch.from_numpy(camera.matrix).to(self._background.device)
         with torch.no_grad():
             drawn = self._map.draw(view, K, camera.width, camera.height, self._near, self._background)
         return as_pictures(*drawn)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ..geometry.se3 import se3_log
 from ..geometry.sim3 import Sim3
 from ..types import View
 from .adam import RowAdam
 from .gaussians import Array
 
 _EXPOSURE_RATE = 2e-3
-_EXPOSURE_PRIOR = 1e-2  # holds the mean exposure near neutral
+_EXPOSURE_PRIOR = 0.3  # holds every exposure near neutral: what few views see could as well be darker, all of it
 _POSE_RATE = 1e-3  # radians, and map units per unit of median depth
 _POSE_RATE_LAST_RATIO = 0.1
 _NAMES = ("log_gain", "bias", "shift", "turn")
@@ -59,17 +60,28 @@ class ViewParameters:
         for name, value in (("shift", shift), ("turn", turn)):
             self._rows[number][name].data.copy_(torch.from_numpy(np.asarray(value, np.float32)))
 
-    def exposed(self, color: torch.Tensor, number: int) -> torch.Tensor:
-        """Colour as that view's exposure shows it: gain * colour + bias."""
+    def put(self, number: int, cam_from_world: Array) -> None:
+        """Correct one training view's pose so that it is ``cam_from_world`` (4, 4)."""
+        xi = se3_log(cam_from_world @ np.linalg.inv(self.tracked_cam_from_world(number)))
+        self.correct(number, xi[:3] / self._depth, xi[3:])
+
+    def exposed(self, color: torch.Tensor, alpha: torch.Tensor, number: int) -> torch.Tensor:
+        """Colour (h, w, 3) over black as that view's exposure shows it: gain * colour + bias * alpha."""
         if not self._exposure:
             return color
         row = self._rows[number]
-        return color * row["log_gain"].exp().to(color.device) + row["bias"].to(color.device)
+        gain, bias = row["log_gain"].exp().to(color.device), row["bias"].to(color.device)
+        return color * gain + alpha[..., None] * bias
 
-    def exposed_at(self, color: torch.Tensor, timestamp_s: float) -> torch.Tensor:
-        """Colour under an exposure interpolated linearly in time between training views."""
-        gain, bias = (self._at(name, timestamp_s).to(color) for name in ("log_gain", "bias"))
-        return color * gain.exp() + bias
+    def centre_exposure(self) -> tuple[Array, Array]:
+        """Make the mean exposure of all views the neutral one: gain and bias (3,) that the map's colours must take."""
+        mean = {name: torch.stack([row[name].detach() for row in self._rows]).mean(0) for name in ("log_gain", "bias")}
+        gain = mean["log_gain"].exp()
+        for row in self._rows:  # g c + b = (g / G) (G c + B) + b - (g / G) B
+            share = (row["log_gain"].detach() - mean["log_gain"]).exp()
+            row["bias"].data.sub_(share * mean["bias"])
+            row["log_gain"].data.sub_(mean["log_gain"])
+        return gain.numpy(), mean["bias"].numpy()
 
     def corrected_at(self, cam_from_world: torch.Tensor, timestamp_s: float) -> torch.Tensor:
         """A tracked pose under the correction interpolated linearly in time between training views."""
