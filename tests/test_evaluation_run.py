@@ -119,8 +119,37 @@ def test_agrees_with_the_independent_scorer(run: RunFolder, sequence: Sequence) 
 def test_without_truth_only_what_can_be_known(run: RunFolder, sequence: Sequence) -> None:
     metrics = evaluate_run(run.path, None, sequence.frames())
     assert set(metrics) == {
-        "frames", "frames_posed", "holdout_frames", "psnr_holdout", "ssim_holdout", "mask_moving_ratio",
+        "frames", "frames_posed", "holdout_frames", "psnr_holdout", "ssim_holdout", "psnr_holdout_fitted",
+        "mask_moving_ratio",
     }  # fmt: skip
+
+
+def test_a_see_through_render_is_told_apart_from_an_opaque_one(run: RunFolder, sequence: Sequence) -> None:
+    """Half of the pixels let through 30 %: over black that is darker, over white lighter, and the share is said."""
+    for old in (run.path / "renders").glob("*.png"):
+        old.unlink()
+    i = 8
+    t, image = float(sequence.times_s[i]), sequence.images[i] / 255
+    alpha = np.ones(image.shape[:2])
+    alpha[:, : image.shape[1] // 2] = 0.7
+    run.write_render(t, image * alpha[..., None])
+    run.write_alpha(t, alpha)
+    truth = Truth(sequence.truth.timestamps_s, sequence.truth.world_from_cam)
+    metrics = evaluate_run(run.path, truth, sequence.frames())
+    black, white = (-10 * np.log10(((image * alpha[..., None] + b * (1 - alpha[..., None]) - image) ** 2).mean())
+                    for b in (0.0, 1.0))  # fmt: skip
+    assert metrics["psnr_holdout"] == pytest.approx(black, abs=0.3)
+    assert metrics["psnr_holdout_white"] == pytest.approx(white, abs=0.3)
+    assert metrics["opaque_holdout"] == pytest.approx(0.5)
+
+
+def test_a_gain_and_a_bias_are_fitted_beside(run: RunFolder, sequence: Sequence) -> None:
+    for old in (run.path / "renders").glob("*.png"):
+        old.unlink()
+    t, image = float(sequence.times_s[8]), sequence.images[8] / 255
+    run.write_render(t, 0.7 * image + 0.1)
+    metrics = evaluate_run(run.path, None, sequence.frames())
+    assert metrics["psnr_holdout_fitted"] > max(35, metrics["psnr_holdout"] + 10)
 
 
 def test_truth_without_masks_does_not_call_anything_a_false_positive(run: RunFolder, sequence: Sequence) -> None:

@@ -21,6 +21,7 @@ from .trajectory_error import AteResult, associate, ate_of_positions, ate_rmse, 
 Array = NDArray[Any]
 PSNR_CEILING_DB = float(10 * np.log10(255**2 / 1e-9))  # stands for equal images, so that a mean exists
 SAME_TIME_S = 0.001  # other systems round timestamps in ways of their own
+OPAQUE = 0.95  # alpha above which nothing is seen through
 MIN_STATIC_PX = 50  # fewer static pixels in a render say nothing
 
 
@@ -33,6 +34,9 @@ class HoldoutError:
     ssim: float
     psnr_static_db: float | None  # over truly static pixels; None where truth has no masks
     ssim_static: float | None = None  # likewise
+    white_db: float | None = None  # PSNR over white instead of black, the same pixels as the static one where it is
+    fitted_db: float | None = None  # over black, after the best gain and bias a channel
+    opaque: float | None = None  # share of those pixels with alpha above 0.95
 
 
 @dataclass(frozen=True)
@@ -190,6 +194,7 @@ def _compare_renders(
 
 
 def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: bool) -> HoldoutError:
+    """A render of the file alone, over black, with the photograph; over white by alpha/ where that is."""
     render = cv2.imread(str(render_path), cv2.IMREAD_COLOR)
     if render is None:
         raise InputError(f"{render_path}: expected a PNG image, got a file that is not one")
@@ -207,7 +212,25 @@ def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: b
         if static.sum() > MIN_STATIC_PX:
             static_db, static_similar = psnr(splat, photograph, static), ssim(splat, photograph, static)
     capped = None if static_db is None else min(static_db, PSNR_CEILING_DB)
-    return HoldoutError(frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped, static_similar)
+    use = static if static_db is not None else np.ones(size[::-1], bool)
+    fitted = psnr(_exposed(splat, photograph, use), photograph, use)
+    alpha_path = render_path.parent.parent / "alpha" / render_path.name
+    white = opaque = None
+    if alpha_path.is_file() and (alpha := read_mask(alpha_path) / 255).shape == use.shape:
+        white, opaque = psnr(splat + (1 - alpha)[..., None], photograph, use), float((alpha[use] > OPAQUE).mean())
+    return HoldoutError(
+        frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped, static_similar, white, fitted, opaque
+    )
+
+
+def _exposed(splat: Array, photograph: Array, use: Array) -> Array:
+    """The render under the gain and bias of every channel that bring it closest to the photograph where ``use`` is."""
+    out = np.empty_like(splat)
+    for c in range(3):
+        a, b = splat[use][:, c], photograph[use][:, c]
+        gain = ((a - a.mean()) * (b - b.mean())).mean() / max(float(a.var()), 1e-9)
+        out[..., c] = np.clip(gain * (splat[..., c] - a.mean()) + b.mean(), 0, 1)
+    return out
 
 
 def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
@@ -222,6 +245,13 @@ def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
     similar = [h.ssim_static for h in holdout if h.ssim_static is not None]
     if similar:
         metrics["ssim_holdout_static"] = float(np.mean(similar))
+    for key in ("white_db", "fitted_db", "opaque"):
+        values = [v for h in holdout if (v := getattr(h, key)) is not None]
+        if values:
+            metrics[_SPLAT_KEYS[key]] = float(np.mean(values))
+
+
+_SPLAT_KEYS = {"white_db": "psnr_holdout_white", "fitted_db": "psnr_holdout_fitted", "opaque": "opaque_holdout"}
 
 
 def _masks(run_dir: Path, stamps: list[str], moving: dict[str, str]) -> MaskError:
