@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from helpers import data_path, write_video
 from mastd3r.cli.main import main
@@ -54,8 +55,10 @@ def test_the_room_at_its_usual_size(tmp_path: Path) -> None:
     assert metrics["focal_px"] == pytest.approx(300, rel=0.1)
     trajectory = rows(out / "trajectory.txt")
     assert trajectory.shape == (48, 8) and np.isfinite(trajectory).all()
-    np.testing.assert_allclose(trajectory[0, 1:], [0, 0, 0, 0, 0, 0, 1], atol=1e-6)  # the world is the first view
     record = json.loads((out / "run.json").read_text())
+    np.testing.assert_allclose(trajectory[0, 1:4], 0, atol=1e-6)  # the world is the first view's, turned upright
+    first = Rotation.from_quat(trajectory[0, 4:]).as_matrix()
+    np.testing.assert_allclose(first, record["world"]["upright_from_first"], atol=1e-6)
     assert record["status"] == "complete" and record["camera"]["found"] == "from the video"
     for name in ("config.yaml", "keyframes.txt", "camera.json", "cloud.ply", "report.html"):
         assert (out / name).stat().st_size > 0

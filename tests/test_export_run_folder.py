@@ -63,7 +63,7 @@ def test_a_whole_run_comes_back(tmp_path: Path) -> None:
     assert (run.mask_times_s().tolist(), run.render_times_s().tolist()) == ([0.1], [0.2])
     assert {p.name for p in folder.path.iterdir()} == {
         "run.json", "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "metrics.json",
-        "masks", "renders", "depth",
+        "masks", "renders", "alpha", "depth",
     }  # fmt: skip
 
 

@@ -104,6 +104,21 @@ def chosen_map_device(config: MappingConfig, notes: list[str]) -> str:
     return device
 
 
+def with_map_effort(config: Config, size: tuple[int, int], device: str, notes: list[str]) -> Config:
+    """``config`` with numbers for what the map's quality decides, of photographs of ``size``; said in ``notes``."""
+    from .mapping.quality import resolved
+
+    if not config.mapping.enabled:
+        return config
+    m = resolved(config.mapping, size, device)
+    spent = f"{m.minutes:g} minutes" if m.minutes else f"{m.iterations} steps"
+    notes.append(
+        f"map quality {m.quality}: images {m.width_px} px wide, {spent}, at most {m.max_gaussians} Gaussians, "
+        f"colours of degree {m.sh_degree}"
+    )
+    return replace(config, mapping=m)
+
+
 def chosen_pointmaps(config: Config) -> tuple[str, str]:
     """The provider's name, and why ``auto`` chose it; no reason where the user did."""
     if config.pointmaps != AUTO:

@@ -56,6 +56,7 @@ def reconstruct(
     slam, notes = _slam_of(source, config, maps)
     folder, temporary = _folder(out, command, [Path(p).expanduser() for p in (source, maps) if p is not None])
     job = slam.job(folder, reporter)
+    folder.update(source={**folder.record["source"], "path": str(Path(source).expanduser().resolve())})
     folder.note(*notes)
     with job:
         _track(slam, job)

@@ -14,6 +14,10 @@ class Bar(Protocol):
         """So many more are done."""
         ...
 
+    def say(self, text: str) -> None:
+        """What is known of the stage now, in one line; it replaces what was said before."""
+        ...
+
 
 class Reporter(Protocol):
     """Where stages say how far they are."""
@@ -25,6 +29,9 @@ class Reporter(Protocol):
 
 class _Nothing:
     def advance(self, steps: int = 1) -> None:
+        pass
+
+    def say(self, text: str) -> None:
         pass
 
 

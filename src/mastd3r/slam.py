@@ -25,7 +25,7 @@ from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
 from .offline.job import RunJob, Tracked
 from .offline.reconstruction import Reconstruction
-from .parts import Parts, build_parts, chosen_map_device
+from .parts import Parts, build_parts, chosen_map_device, with_map_effort
 from .progress import Reporter, Silent
 from .sources.recorded import RecordedSource
 from .sources.rectified import RectifiedSource, rectified
@@ -86,6 +86,7 @@ class Slam:
         seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
         self.parts = parts if parts is not None else build_parts(self.config, seen)
         self.map_device = chosen_map_device(self.config.mapping, self.parts.notes)
+        self.config = with_map_effort(self.config, self.source.size, self.map_device, self.parts.notes)
         self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen.size)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
         self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)

@@ -17,7 +17,7 @@ from rich.table import Table
 
 from ..config import Config, config_to_yaml
 from ..errors import ConfigError
-from .options import config_from_args
+from .options import checked_minutes, config_from_args
 
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
@@ -29,6 +29,21 @@ def run(args: argparse.Namespace, console: Console) -> int:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
     return _run_and_show(args.source, args.out, config, args.words, console, quiet=args.quiet, maps=args.maps)
+
+
+def train_map(args: argparse.Namespace, console: Console) -> int:
+    """``mastd3r map``."""
+    from ..pipeline import load
+    from ..progress import Silent
+    from .terminal import Terminal
+
+    minutes = None if args.minutes is None else checked_minutes(args.minutes, "--minutes")
+    run = load(args.run)
+    reporter = Silent() if args.quiet else Terminal(console)
+    metrics = run.train_map(minutes, args.quality, source=args.source, reporter=reporter)
+    Console().print(_table(metrics))
+    Console().print(f"Open [bold]{run.path / 'report.html'}[/bold]", soft_wrap=True)
+    return 0
 
 
 def _interrupt_when_stdin_closes() -> None:

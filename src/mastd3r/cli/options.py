@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from dataclasses import replace
 
 from ..config import Config, config_from_yaml, preset, with_override
@@ -23,10 +24,16 @@ def config_from_args(args: argparse.Namespace) -> Config:
     config = replace(config, source=replace(config.source, **window))
     if args.map_loss is not None:
         config = replace(config, mapping=replace(config.mapping, loss=args.map_loss))
-    if args.realtime and args.no_map:
-        raise ConfigError("--realtime: expected a map to be made, got --no-map")
+    for name in ("realtime", "quality", "map_minutes"):
+        if args.no_map and getattr(args, name) not in (None, False):
+            raise ConfigError(f"--{name.replace('_', '-')}: expected a map to be made, got --no-map")
     if args.realtime:
         config = replace(config, mapping=replace(config.mapping, realtime=True))
+    if args.quality is not None:
+        config = replace(config, mapping=replace(config.mapping, quality=args.quality))
+    if args.map_minutes is not None:
+        minutes = checked_minutes(args.map_minutes, "--map-minutes")
+        config = replace(config, mapping=replace(config.mapping, minutes=minutes))
     if args.no_map:
         config = replace(config, mapping=replace(config.mapping, enabled=False))
     if args.maps is not None and config.semantics == "auto":
@@ -37,6 +44,13 @@ def config_from_args(args: argparse.Namespace) -> Config:
         given = _numbers(args.intrinsics)
         config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
     return config
+
+
+def checked_minutes(minutes: float, option: str) -> float:
+    """Minutes that a training can be given. Raises ConfigError, naming the option."""
+    if not 0 < minutes < math.inf:
+        raise ConfigError(f"{option}: expected a finite number of minutes above 0, got {minutes:g}")
+    return minutes
 
 
 def _numbers(text: str) -> tuple[float, ...]:

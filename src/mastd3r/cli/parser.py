@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NoReturn, get_args
 
 from .. import __version__
-from ..config import PRESETS, MapLossKind, SourceKind
+from ..config import PRESETS, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
@@ -16,6 +16,11 @@ from .download import download_parser
 from .weights import weights_parser
 
 INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
+QUALITY_HELP = (
+    "image width, steps and number of Gaussians of the map, more on an accelerator than on the CPU "
+    f"(default {Config().mapping.quality})"
+)
+MINUTES_HELP = "train the map for so long, instead of for the number of steps of its quality (the default)"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -31,6 +36,7 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("-v", "--verbose", action="store_true", help="say more")
     known = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(known.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
+    _map_parser(known.add_parser("map", help="go on with the map of a run that has ended"))
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
@@ -56,6 +62,17 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def _map_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("run", type=Path, help="run folder; its splat, poses, renders, figures and report are renewed")
+    p.add_argument("--minutes", type=float, metavar="M", help="of training (default: as the run's config.yaml says)")
+    p.add_argument(
+        "--quality", choices=get_args(MapQualityKind), help="instead of the run's; the map never becomes coarser"
+    )
+    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
+    p.set_defaults(act=commands.train_map)
+
+
 def _eval_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("paths", type=Path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
     p.add_argument("--trajectory", type=Path, metavar="FILE", help="poses that another system has written")
@@ -75,6 +92,8 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
+    p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
+    p.add_argument("--map-minutes", type=float, metavar="M", help=MINUTES_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
     p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")

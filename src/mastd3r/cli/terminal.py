@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
     ProgressColumn,
     Task,
+    TaskID,
     TextColumn,
     TimeRemainingColumn,
 )
@@ -26,12 +27,26 @@ class _Speed(ProgressColumn):
         return Text(f"{speed:6.1f} {task.fields['unit']}/s" if speed else "", style="cyan")
 
 
+class _Progress(Progress):
+    """Bars, and below them the line that was said last."""
+
+    said = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        yield from super().get_renderables()
+        if self.said:
+            yield Text(self.said, style="dim", overflow="ellipsis")
+
+
 class _RichBar:
-    def __init__(self, progress: Progress, task: int) -> None:
+    def __init__(self, progress: _Progress, task: TaskID) -> None:
         self._progress, self._task = progress, task
 
     def advance(self, steps: int = 1) -> None:
-        self._progress.advance(self._task, steps)  # type: ignore[arg-type]
+        self._progress.advance(self._task, steps)
+
+    def say(self, text: str) -> None:
+        self._progress.said = text
 
 
 class Terminal:
@@ -46,7 +61,7 @@ class Terminal:
             TextColumn("{task.description:<12}"), BarColumn(), MofNCompleteColumn(), _Speed(),
             TextColumn("left"), TimeRemainingColumn(),
         )  # fmt: skip
-        with Progress(*columns, console=self.console) as progress:
+        with _Progress(*columns, console=self.console) as progress:
             task = progress.add_task(name, total=total, unit=unit)
             yield _RichBar(progress, task)
             if total is None:

@@ -14,7 +14,7 @@ FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "gaussians.ply", "gaussians.spz",
     "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
 )  # fmt: skip
-FOLDERS = ("masks", "renders", "depth")
+FOLDERS = ("masks", "renders", "alpha", "depth")
 RESERVE = ".reserve"
 PICTURE = re.compile(r"-?\d+\.\d{6}\.png")  # as a run names them; other files of its folders are somebody else's
 RECORD = {"status": str, "command": list, "machine": dict, "choices": list, "timings_s": dict}  # of our run.json
@@ -44,6 +44,13 @@ def claim(folder: Path, inputs: Sequence[Path] = ()) -> None:
             for old in (folder / name).iterdir():
                 if PICTURE.fullmatch(old.name):
                     old.unlink()
+
+
+def check_ours(folder: Path) -> None:
+    """Raise OutputError for a folder that is no run of ours, or whose names of ours are symbolic links."""
+    _refuse_links(folder)
+    if not _is_ours(folder):
+        raise OutputError(f"{folder}: expected a run folder, got a folder whose run.json is not one of a run")
 
 
 def _refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:

@@ -36,11 +36,17 @@ def writing(path: Path) -> Iterator[None]:
 
 def write_bytes(path: Path, data: bytes) -> None:
     """Write a file whole or not at all: a temporary beside it, then a rename. Raises OutputError."""
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(data)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary beside ``path`` for the body to write; it takes the place of ``path`` only once the body is done."""
     temporary = path.with_name(path.name + ".part")
     with writing(path):
         try:
-            with open(temporary, "wb") as file:
-                file.write(data)
+            yield temporary
             os.replace(temporary, path)
         except BaseException:
             with suppress(OSError):

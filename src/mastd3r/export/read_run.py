@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..camera.pinhole import Camera
 from ..errors import InputError
 from ..types import State, Trajectory
+from .claim import PICTURE
 from .run_folder import stamp
 from .trajectory_files import read_tum
 
@@ -107,7 +108,7 @@ def _camera(path: Path) -> tuple[Camera, tuple[float, ...]]:
 
 
 def _times(folder: Path) -> Array:
-    return np.array(sorted(float(p.stem) for p in folder.glob("*.png")), float)
+    return np.array(sorted(float(p.stem) for p in folder.glob("*.png") if PICTURE.fullmatch(p.name)), float)
 
 
 def _read_image(path: Path, mode: int) -> Array:

@@ -56,6 +56,13 @@ class RunFolder:
         write_bytes(self._reserve, os.urandom(RESERVE_BYTES))
         self._save()
 
+    @classmethod
+    def again(cls, path: Path, record: dict[str, Any]) -> RunFolder:
+        """A folder to write files of a run in that has ended: nothing is removed; ``record`` is its run.json."""
+        folder = cls.__new__(cls)
+        folder.path, folder._reserve, folder.record = Path(path), Path(path) / RESERVE, record
+        return folder
+
     def update(self, **fields: Any) -> None:
         """Add fields to run.json, or replace them."""
         self.record.update(fields)
@@ -120,6 +127,10 @@ class RunFolder:
                 raise OutputError(f"render at {stamp(timestamp_s)} s: expected finite colours, got some that are not")
             image = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
         write_png(self.path / "renders", timestamp_s, np.ascontiguousarray(image[..., ::-1]))
+
+    def write_alpha(self, timestamp_s: float, alpha: Array) -> None:
+        """alpha/<timestamp>.png: (h, w) in 0..1, how opaque the render of the same name is."""
+        write_png(self.path / "alpha", timestamp_s, np.rint(np.clip(alpha, 0, 1) * 255).astype(np.uint8))
 
     def write_depth(self, timestamp_s: float, depth: Array, per_unit: float) -> None:
         """depth/<timestamp>.png, see ``write_depth_png``."""

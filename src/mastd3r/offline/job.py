@@ -23,10 +23,9 @@ from ..evaluation.evaluate import evaluate
 from ..export.evidence import EvidenceSample
 from ..export.machine import peak_rss_mib
 from ..export.mask_video import MaskVideo
-from ..export.read_run import read_run
-from ..export.report import write_report
-from ..export.report_data import gather_report_data
 from ..export.run_folder import RunFolder
+from ..geometry.sim3 import Sim3
+from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.keyframe_graph import KeyframeGraph
 from ..mapping.process import Outcome
 from ..mapping.rasterise import accelerator
@@ -36,12 +35,15 @@ from ..tracking.depth_prior import own_depth_spread
 from ..types import Frame, Source, StaticCloud
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from .live_map import LiveMap
-from .map_stage import train_map, write_renders_and_flight
+from .map_stage import TrainedMap, train_map, write_renders_and_flight
+from .placement import place_frames
+from .run_report import write_run_report
 from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
 from .static_cloud import static_cloud
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+NO_MAP_PX = 64  # width of the map's images where there is no map, which nothing is drawn in
 
 
 @dataclass(frozen=True)
@@ -128,6 +130,7 @@ class RunJob:
             if assumed is not None and found is not None:
                 spread = f"own depths differ from the solved ones by {found:.1%} (1 sigma), assumed {assumed:.1%}"
                 self.folder.note(spread)
+            self._turn_upright()
             self._final = final_frames(graph)
             self._write_trajectory()
             if self._live is not None:
@@ -138,7 +141,7 @@ class RunJob:
     def smooth_masks(self, appearance: Any) -> MapMaterial:
         """Masks under the final poses, every frame placed once more under them, and the static cloud."""
         m = self.config.mapping
-        map_view = MapView(self.tracked.lens(), m.width_px, m.tau_uncertainty_px)
+        map_view = MapView(self.tracked.lens(), m.width_px or NO_MAP_PX, m.tau_uncertainty_px)
         with self.timed("masks"):
             seen = self._masks(map_view, appearance)
         with self.timed("poses under the masks"):
@@ -163,16 +166,40 @@ class RunJob:
                 self.folder, self.config, cloud, views, self.tracked.map_device, self._begun, self.reporter
             )
         self.metrics |= trained.metrics
+        if self.config.mapping.refine_poses and self.graph.started:
+            self._place_frames(trained)
+        place = {f.record.index: f for f in self._final}
         write_renders_and_flight(
-            trained.mapper,
+            trained,
             self.folder,
-            material.seen,
+            [place[f.record.index] for f in material.seen.holdout],
             material.map_view,
             self._final,
             self.tracked.lens(),
             self.timed,
             self.reporter,
         )
+
+    def _place_frames(self, trained: TrainedMap) -> None:
+        """Every frame's pose read off the finished map, so that the trajectory agrees with the splat."""
+        folder = self.folder
+
+        def start(frame: FinalFrame) -> Array:
+            return trained.mapper.refined_pose(frame.world_from_cam, frame.record.timestamp_s)
+
+        with self.timed("poses in the map"), self.reporter.stage("poses", len(self._final), "frames") as bar:
+            placement = place_frames(
+                self.source.frames(),
+                self._final,
+                trained.splat,
+                self.tracked.lens(),
+                start,
+                folder.path / "masks",
+                bar.advance,
+            )
+        self._final = placement.final
+        self._write_trajectory()
+        folder.update(placement=placement.facts)
 
     def report(self) -> None:
         """Figures against the truth, where there is one, and the report."""
@@ -195,18 +222,7 @@ class RunJob:
             self.folder.write_aligned(aligned)
         self.folder.update(timings_s=self.timings)
         self.folder.finish()
-        recorded = read_run(self.folder.path)
-        ate = evaluation.ate
-        data = gather_report_data(
-            recorded,
-            self.source.frames(),
-            {h.timestamp_s: h.psnr_db for h in evaluation.holdout},
-            ate.truth_in_map(len(recorded.trajectory.timestamps_s)) if ate and ate.rmse is not None else None,
-            ate.scale if ate and ate.rmse is not None else None,
-            title=self.source.name,
-            evidence=self._evidence,
-        )
-        write_report(self.folder.path, data)
+        write_run_report(self.folder.path, self.source, evaluation, self._evidence)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -217,6 +233,20 @@ class RunJob:
         finally:
             self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - began
             self.folder.record["timings_s"] = self.timings
+
+    def _turn_upright(self) -> None:
+        """The world with gravity along +y, as viewers of splats expect it of such files."""
+        graph = self.graph
+        members = graph.members()
+        direction, sigma = down(np.stack([graph.world_from_cam(k) for k in members]))
+        turn = turn_upright(direction)
+        graph.transform_keyframes(range(len(graph.keyframes)), Sim3(turn, np.zeros(3)))
+        told = sigma < TOLD_RAD
+        self.folder.note(
+            f"world upright: down is +y, from {'the horizon of' if told else 'the down axes of'} {len(members)} "
+            f"keyframes, to {np.degrees(sigma):.0f} deg (1 sigma)"
+        )
+        self.folder.update(world={"down_sigma_deg": float(np.degrees(sigma)), "upright_from_first": turn.tolist()})
 
     # -- parts of the stages ---------------------------------------------------------------------------------
 

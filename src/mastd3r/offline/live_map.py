@@ -120,7 +120,7 @@ def _news(k: int, seen: _Seen, graph: KeyframeGraph, map_view: MapView, steps: i
     kf, pose = graph.keyframes[k], graph.world_from_cam(k)
     image, inside = map_view.pinhole_image(seen.photograph.image)
     static = np.clip(1 - map_view.pinhole_map(kf.moving.astype(np.float32) / 255), 0.01, 1) * inside
-    view = View(seen.photograph.timestamp_s, image, static.astype(np.float32), pose, map_view.pinhole, k)
+    view = View(seen.photograph.timestamp_s, image, static.astype(np.float16), pose, map_view.pinhole, k)
     at = np.round(graph.variables[k].px).astype(int)
     cloud = static_cloud(graph, {k: seen.tracked[at[:, 1], at[:, 0]]}, {k: 1 - kf.static})
     return KeyframeNews(view, cloud, pose, steps)

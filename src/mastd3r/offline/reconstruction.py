@@ -15,19 +15,24 @@ from numpy.typing import NDArray
 
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
-from ..config import Config, config_from_dict
-from ..errors import ConfigError
+from ..concurrency import one_blas_thread
+from ..config import Config, MapQualityKind, config_from_dict
+from ..errors import ConfigError, InputError
 from ..evaluation.evaluate import evaluate
 from ..export.claim import claim
 from ..export.files import write_json, writing
 from ..export.formats import export_run
 from ..export.point_cloud import read_cloud
 from ..export.read_run import Run, read_run
+from ..export.run_folder import RunFolder
 from ..mapping.gaussians import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
+from ..progress import Reporter, Silent
 from ..sources import open_source
 from ..types import StaticCloud
+from .continued_map import continue_map
 from .renders import export_splat, lens_of
+from .run_report import write_run_report
 
 Array = NDArray[Any]
 SPLAT_FORMATS = ("spz", "flight", "depth")
@@ -156,6 +161,47 @@ class Reconstruction:
         write_json(self.path / "metrics.json", metrics)
         self._run = read_run(self.path)
         return metrics
+
+    @one_blas_thread()
+    def train_map(
+        self,
+        minutes: float | None = None,
+        quality: MapQualityKind | None = None,
+        *,
+        source: str | Path | None = None,
+        reporter: Reporter | None = None,
+    ) -> dict[str, Any]:
+        """Go on with the map, as ``mastd3r map``; gives the figures of metrics.json from here on.
+
+        minutes: of training; by default as many steps, or minutes, as the options say. quality: draft, standard or
+        high, instead of that of the run. source: where the photographs are, if no longer where the run read them.
+        Raises InputError for a run without map and cloud, and a source that is not the run's, before anything has
+        changed; ConfigError; OutputError, and what was there last stays.
+        """
+        if minutes is not None and not 0 < minutes < np.inf:
+            raise ConfigError(f"minutes: expected a finite number above 0, got {minutes:g}")
+        opened = open_source(self._photographs(source), self.config.source, want_semantic=False)
+        trained = continue_map(self._run, opened, self.config, minutes, quality, reporter or Silent())
+        self.__dict__.pop("gaussians", None)
+        evaluation = evaluate(self.path, opened.truth(), opened.frames())
+        metrics = {**self.metrics, **evaluation.metrics, **trained}
+        write_json(self.path / "metrics.json", metrics)
+        if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
+            RunFolder.again(self.path, self._run.record).write_aligned(aligned)
+        write_run_report(self.path, opened, evaluation)
+        self._run = read_run(self.path)
+        return metrics
+
+    def _photographs(self, source: str | Path | None) -> Path:
+        """Where the photographs of the run are."""
+        said = source if source is not None else (self._run.record.get("source") or {}).get("path", "")
+        path = Path(said).expanduser()
+        if source is None and (not said or not path.exists()):
+            raise InputError(
+                f"{self.path}/run.json: expected the photographs at its source.path, got no such path as "
+                f"{str(said)!r}; say with --source where they are"
+            )
+        return path
 
     def save(self, path: str | Path) -> Path:
         """Copy the run folder to ``path``, and stay there. Raises OutputError where that is not ours to write."""

@@ -20,6 +20,7 @@ from ..export.read_run import Run, read_run
 from ..export.run_folder import write_depth_png
 from ..export.video import write_video
 from ..geometry.path import smoothed_path
+from ..mapping.mapper import NEAR_RATIO
 from ..mapping.ply import read_gaussians_ply
 from ..mapping.splat import Splat
 from ..mapping.spz import write_gaussians_spz
@@ -85,7 +86,7 @@ def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
         write_gaussians_spz(out, gaussians)
         return out
     lens, facts = lens_of(run), _facts(run)
-    splat = Splat(gaussians, facts["near"], facts["background"])
+    splat = Splat(gaussians, NEAR_RATIO * facts["median_depth"])
     if kind == "flight":
         poses = flight_path(run.trajectory.timestamps_s, run.trajectory.world_from_cam)
         write_flight(out, splat.render, flight_camera(lens), poses)
@@ -114,6 +115,6 @@ def lens_of(run: Run) -> Camera | OpenCvLens:
 
 def _facts(run: Run) -> dict[str, Any]:
     facts = run.record.get("map")
-    if not isinstance(facts, dict) or not {"near", "background", "median_depth"} <= set(facts):
+    if not isinstance(facts, dict) or "median_depth" not in facts:
         raise InputError(f"{run.path}/run.json: expected what was written of the map (key map), got none")
     return facts

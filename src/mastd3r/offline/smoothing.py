@@ -105,7 +105,7 @@ def smooth_masks(
     """
     out, votes = SmoothedMasks(), PointVotes()
     graph, parts = context.graph, context.parts
-    chosen = _view_positions(context.final, context.config)
+    chosen = view_positions(context.final, context.config)
     smoother = parts.dynamics.smoother(*parts.provider.size, context.appearance)
     uncoloured: list[int] = []  # keyframes without colours yet
     written = deque[Future[None]]()
@@ -181,7 +181,7 @@ def _at_expected_scale(given: DynamicsInput) -> DynamicsInput:
     return replace(given, own_inv_depth=own / scale)
 
 
-def _view_positions(final: list[FinalFrame], config: Config) -> set[int]:
+def view_positions(final: list[FinalFrame], config: Config) -> set[int]:
     """Positions of the training views: keyframes first, then evenly; never holdout, never a guessed pose."""
     usable = [n for n, f in enumerate(final) if not is_holdout(n) and f.state in ("tracked", "started")]
     most = config.mapping.max_views if config.mapping.enabled else 0
@@ -221,18 +221,22 @@ def _view(waiting: _Waiting, moving: Array, context: SmoothingContext) -> View:
     (image, inside), place, map_view = waiting.photograph, waiting.place, context.map_view
     uncertainty = waiting.uncertainty
     if uncertainty is not None:
-        uncertainty = map_view.pinhole_map(_over_photograph(uncertainty, context.rectifier))
-    p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
-    static = np.clip(1 - map_view.pinhole_map(p), 0.01, 1) * inside  # exactly 0 means: no data
+        uncertainty = map_view.pinhole_map(_over_photograph(uncertainty, context.rectifier)).astype(np.float16)
     return View(
         place.record.timestamp_s,
         image,
-        static.astype(np.float32),
+        view_static(moving, inside, map_view),
         place.world_from_cam,
         map_view.pinhole,
         place.record.kf_id,
         uncertainty,
     )
+
+
+def view_static(moving: Array, inside: Array, map_view: MapView) -> Array:
+    """(h, w) float16 P(static) over the pinhole image, of P(moving) over the photograph; exactly 0 means: no data."""
+    p = cv2.dilate(moving.astype(np.float32), np.ones((5, 5)))  # the edge of a moving thing is not static
+    return np.asarray(np.clip(1 - map_view.pinhole_map(p), 0.01, 1) * inside, np.float16)
 
 
 def _uncertainty(
