@@ -40,6 +40,7 @@ FAILURES += (AssertionError, subprocess.CalledProcessError)
 MAX_COLOR_DIFFERENCE, MAX_GRADIENT_ERROR = 1e-3, 1e-4  # the bounds that the figures are held to
 SEEDS = (0, 1, 2)
 VIEWS, WARM_UP, SETTLE = 24, 30, 15
+GPU_WIDTH_PX = 320  # of the images, at most
 Drawn = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
@@ -149,7 +150,7 @@ def training_set(arrays: GaussianArrays, camera: Camera, poses: np.ndarray) -> l
     views = []
     for n in numbers:
         with torch.no_grad():
-            image = drawn(source, poses[n], camera)[0].clamp(0, 1).numpy()
+            image = (drawn(source, poses[n], camera)[0].clamp(0, 1).numpy() * 255).round().astype(np.uint8)
         views.append(View(float(n), image, ones, poses[n], camera, 0))
     return views
 
@@ -242,7 +243,7 @@ def main() -> int:
     devices = ["cpu"] if device == "cpu" else [device, "cpu"]
     if device != "cpu":  # gsplat compiles its kernels at the first call
         report.part("gsplat_first_call", lambda: {"error_max": gradient_errors(device)["worst"]})
-    loaded = report.part("map", lambda: read_map(args.run, MappingConfig().width_px))
+    loaded = report.part("map", lambda: read_map(args.run, GPU_WIDTH_PX))
     for on in devices:
         report.part(f"gradients_{on}", lambda on=on: gradient_errors(on))
     if loaded is not None:

@@ -35,6 +35,7 @@ from mastd3r.offline.job import MapMaterial
 from mastd3r.sources import open_source
 
 SEQUENCE, MOVED_M, BOUND_DB = "kitchen", 0.05, 0.5
+WIDTH_PX = 320  # of the images
 
 
 def metres_per_unit(sequence: Path, run: Path) -> float:
@@ -72,7 +73,8 @@ def quality(
     for place in given.seen.holdout:
         if np.isfinite(place.world_from_cam).all():
             pose, time_s = drift[place.record.kf_id] @ place.world_from_cam, place.record.timestamp_s
-            drawn = given.map_view.as_photograph(mapper.render(pose, given.map_view.pinhole, time_s)[0])
+            pose = mapper.refined_pose(pose, time_s)
+            drawn = given.map_view.as_photograph(mapper.render(pose, given.map_view.pinhole)[0])
             figures.append(psnr(drawn.clip(0, 1), pictures[round(time_s, 6)][0]))
     return float(np.mean([f for f in figures if f is not None]))
 
@@ -106,7 +108,7 @@ def main() -> int:
     )
     args = parser.parse_args()
     args.runs.mkdir(parents=True, exist_ok=True)
-    given = material(args.data / SEQUENCE, args.runs)
+    given = material(args.data / SEQUENCE, args.runs, WIDTH_PX)
     size = given.map_view.camera.width, given.map_view.camera.height
     times_s = [place.record.timestamp_s for place in given.seen.holdout]
     pictures = clean_pictures(args.data / SEQUENCE, args.data / SEQUENCE, times_s, size)
@@ -115,7 +117,11 @@ def main() -> int:
     keyframes = sorted({*keyframes, *(p.record.kf_id for p in given.seen.holdout)})
     drift, right = drift_of(keyframes, shift), drift_of(keyframes, 0.0)
     config = replace(
-        Config().mapping, iterations=args.iterations + max(args.after), max_gaussians=args.gaussians, device="cpu"
+        Config().mapping,
+        iterations=args.iterations + max(args.after),
+        max_gaussians=args.gaussians,
+        device="cpu",
+        refine_poses=True,
     )
     drifted = distorted(given, drift)
     mapper = Mapper(config, drifted.cloud, drifted.seen.views, 0)

@@ -36,9 +36,9 @@ ABLATION = {  # row -> options of section mapping
     "default": [],
     "no D-SSIM term": ["ssim_share=0.0"],
     "no exposure": ["exposure=false"],
-    "no pose refinement": ["refine_poses=false"],
+    "poses refined": ["refine_poses=true"],
     "hard weight": ["hard_weight=true"],
-    "loss as printed": ["paper_loss=true", "hard_weight=true", "exposure=false", "refine_poses=false"],
+    "loss as printed": ["paper_loss=true", "hard_weight=true", "exposure=false"],
     "harmonics of degree 1": ["sh_degree=1"],
     "harmonics of degree 3": ["sh_degree=3"],
 }
@@ -46,14 +46,17 @@ LEAST_HIDDEN_PX = 50  # frames with fewer hidden pixels do not count for the sec
 Pictures = dict[float, tuple[np.ndarray, np.ndarray | None]]
 
 
-def material(sequence: Path, runs: Path) -> MapMaterial:
-    """What maps are trained from; tracked once and kept beside the run."""
-    kept = runs / f"{sequence.name}-material.pkl"
+def material(sequence: Path, runs: Path, width_px: int) -> MapMaterial:
+    """What maps are trained from, images of ``width_px``; tracked once and kept beside the run."""
+    kept = runs / f"{sequence.name}-material-{width_px}.pkl"
     if kept.is_file():
         with kept.open("rb") as file:
             found: MapMaterial = pickle.load(file)  # our own file, written below
             return found
-    found = material_for_map(sequence, runs / sequence.name, Config())
+    config = Config()
+    found = material_for_map(
+        sequence, runs / sequence.name, replace(config, mapping=replace(config.mapping, width_px=width_px))
+    )
     with kept.open("wb") as file:
         pickle.dump(found, file)
     return found
@@ -77,14 +80,15 @@ def trained(given: MapMaterial, config: MappingConfig, seed: int, pictures: Pict
     """One map, and the figures of its holdout renders."""
     began = time.perf_counter()
     mapper = Mapper(config, given.cloud, given.seen.views, seed)
-    mapper.refine(config.iterations)
+    mapper.refine(config.iterations or 0)
+    mapper.settle()
     seconds = time.perf_counter() - began
     whole, hidden, similar = [], [], []
     for place in given.seen.holdout:
         if not np.isfinite(place.world_from_cam).all():
             continue
         time_s = place.record.timestamp_s
-        color, _, _ = mapper.render(place.world_from_cam, given.map_view.pinhole, time_s)
+        color, _, _ = mapper.render(place.world_from_cam, given.map_view.pinhole)
         drawn = given.map_view.as_photograph(color).clip(0, 1)
         truth, moved = pictures[round(time_s, 6)]
         whole.append(psnr(drawn, truth))
@@ -127,6 +131,7 @@ def main() -> int:
     parser.add_argument("--runs", type=Path, default=Path("runs"))
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--gaussians", type=int, default=30000)
+    parser.add_argument("--width", type=int, default=320, help="of the images, in pixels")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--no-ablation", action="store_true")
     parser.add_argument("--only", nargs="*", default=None, help="rows to train, by name")
@@ -139,7 +144,7 @@ def main() -> int:
     if done["schedule"] != schedule:
         parser.error(f"{args.out}: expected the schedule {schedule}, got {done['schedule']}; delete it to start again")
     base = replace(MappingConfig(), iterations=args.iterations, max_gaussians=args.gaussians, device="cpu")
-    given, info = material(args.data / SEQUENCE, args.runs), machine_info()
+    given, info = material(args.data / SEQUENCE, args.runs, args.width), machine_info()
     camera = given.map_view.camera
     times_s = [place.record.timestamp_s for place in given.seen.holdout]
     pictures = clean_pictures(args.data / SEQUENCE, args.data / CLEAN, times_s, (camera.width, camera.height))
