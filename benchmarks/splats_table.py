@@ -10,10 +10,10 @@ HEAD = """## The splat file alone
 
 By `python benchmarks/splats.py --data DATA --out {source} --check CHECKER`: a renderer that shares no code with this
 project draws `gaussians.ply` from the poses of `trajectory.txt` at every eighth frame, which the map has never seen;
-nothing is fitted, nothing near is cut away. *gain*: after one gain a view. *opaque*: share of the pixels with alpha above
-0.95; *near*: share whose depth is below a third of the view's median. Pixels are those that the true mask calls static,
-or all of the clean photograph (kitchen_walk). *ours*: `psnr_holdout_static` or `psnr_holdout` and `ssim_holdout` of
-metrics.json at the width of the renders.
+nothing is fitted, nothing near is cut away. *gain*: after one gain a view. *opaque*: share of the pixels with alpha
+above 0.95; *near*: share whose depth is below a third of the view's median. Pixels are those that the true mask calls
+static, or all of the clean photograph (kitchen_walk). *ours*: `psnr_holdout_static` or `psnr_holdout` and
+`ssim_holdout` of metrics.json at the width of the renders.
 """
 COLUMNS = (
     "width [px]", "Gaussians", "over black [dB]", "over white [dB]", "gain [dB]", "opaque", "near", "ours [dB]", "SSIM",

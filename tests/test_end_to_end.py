@@ -19,6 +19,7 @@ from mastd3r.config import HOLDOUT_EVERY
 from mastd3r.sources.synthetic import make_room_clip
 
 SCORE = Path(__file__).resolve().parents[2] / "shared" / "tools" / "score.py"
+LOOK = SCORE.with_name("splat_check.py")
 
 
 def metrics_of(folder: Path) -> dict[str, Any]:
@@ -39,6 +40,16 @@ def independent_score(run: Path, clip: Path) -> dict[str, Any]:
     if not SCORE.is_file():
         pytest.skip("the independent scorer is not at hand")
     done = subprocess.run([sys.executable, str(SCORE), str(run), str(clip)], capture_output=True, text=True, check=True)
+    data: dict[str, Any] = json.loads(done.stdout)
+    return data
+
+
+def independent_look(run: Path, clip: Path, width: int) -> dict[str, Any]:
+    """The splat file, drawn by code that shares nothing with ours."""
+    if not LOOK.exists():
+        pytest.skip(f"no {LOOK}")
+    command = [sys.executable, str(LOOK), str(run), str(clip), "--width", str(width)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     data: dict[str, Any] = json.loads(done.stdout)
     return data
 
@@ -132,9 +143,10 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     for key in (
         "frames", "frames_posed", "keyframes", "ate_rmse_all", "psnr_holdout", "psnr_holdout_static", "psnr_mapped",
         "ssim_holdout", "mask_iou", "mask_false_positive_ratio", "mask_moving_ratio", "fps_tracking", "fps_total",
-        "peak_rss_mib", "focal_px",
+        "peak_rss_mib", "focal_px", "psnr_holdout_white", "psnr_holdout_fitted", "opaque_holdout",
     ):  # fmt: skip
         assert isinstance(metrics[key], int | float) and np.isfinite(metrics[key]), key
+    assert {p.name for p in (out / "alpha").iterdir()} == holdout and metrics["opaque_holdout"] > 0.5
     assert metrics["psnr_holdout"] > 12 and metrics["psnr_mapped"] > 12
     what_is_shown_of_a_map(out, holdout, tmp_path)
     scored = independent_score(out, room_clip)
@@ -142,6 +154,23 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     assert scored["ate_all"] == pytest.approx(metrics["ate_rmse_all"], rel=1e-3)
     assert scored["psnr"] == pytest.approx(metrics["psnr_holdout"], rel=1e-3)
     assert scored["mask_fp"] == pytest.approx(metrics["mask_false_positive_ratio"], rel=1e-2, abs=1e-4)
+    file_alone = independent_look(out, room_clip, 160)
+    assert file_alone["psnr_black"] == pytest.approx(metrics["psnr_holdout_static"], abs=0.5)
+    assert file_alone["psnr_white"] == pytest.approx(metrics["psnr_holdout_white"], abs=0.5)
+    assert file_alone["opaque"] == pytest.approx(metrics["opaque_holdout"], abs=0.03) and file_alone["near"] < 0.02
+
+
+@pytest.mark.usefixtures("short_flight")
+def test_refined_poses_are_those_of_the_trajectory(room_clip: Path, tmp_path: Path) -> None:
+    """Where training moves the cameras, every frame is placed in the map, and the file is judged from there."""
+    out = tmp_path / "out"
+    changed = ("mapping.iterations=60", "mapping.width_px=160", "mapping.refine_poses=true", "tracking.cell_px=5")
+    sets = [word for c in changed for word in ("--set", c)]
+    assert main(["run", str(room_clip), "--out", str(out), "--quiet", *sets]) == 0
+    facts = json.loads((out / "run.json").read_text())
+    frames = metrics_of(out)["frames"]
+    assert facts["placement"]["frames"] == frames >= facts["placement"]["placed"]
+    assert rows(out / "trajectory.txt").shape == (frames, 8) and metrics_of(out)["ate_rmse_all"] < 0.1
 
 
 def what_is_shown_of_a_map(out: Path, holdout: set[str], tmp_path: Path) -> None:

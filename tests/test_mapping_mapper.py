@@ -294,7 +294,7 @@ def test_harmonics_learn_a_colour_that_changes_with_the_side(truth: GaussianMap)
     shiny.sh_rest[:, 2] = 3.0  # the band along x
     views = [view(shiny, i) for i in range(12)]
     plain, harmonic = (holdout_psnr(trained(views, steps=240, exposure=False, sh_degree=d), shiny) for d in (0, 1))
-    assert harmonic > plain + 0.5
+    assert harmonic > plain + 0.2
 
 
 def test_options_outside_their_range_are_refused(truth: GaussianMap) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 import torch
 
@@ -24,7 +23,6 @@ from .coverage import gaps_filled
 from .densify import DensifyPolicy, DensifySettings
 from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, squared_color_error
-from .placing import placed
 from .quality import resolved
 from .sampling import Sampling, sampled
 from .schedule import Pace
@@ -55,8 +53,7 @@ DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaus
 SH_FROM = 0.4  # of the training; before that, colours do not depend on the direction
 NEAR_RATIO = 1e-3  # of the median depth: nearer than that no viewer draws
 LEAST_SIGMA_PX = 0.2  # standard deviation of the smallest Gaussian, in pixels of the view that sees it largest
-PLACE_PX = 320  # width of the pictures that training views are placed by
-MAX_VISIBILITIES = 48  # views that are drawn to see which keyframes a Gaussian follows
+MAX_VISIBILITIES = 48  # views that are drawn to see what Gaussians they see
 
 
 class Mapper:
@@ -150,30 +147,12 @@ class Mapper:
         with torch.no_grad():
             return np.linalg.inv(self._view_parameters.corrected_at(cam_from_world, timestamp_s).numpy())
 
-    def place_views(self) -> int:
-        """Read every training view's pose off the map as it is now (``placing.py``); gives how many could be placed."""
-        count = 0
-        for number, view in enumerate(self._views):
-            camera = shrunk(view.camera, max(1, round(view.camera.width / PLACE_PX)))
-            target, weight = self._targets.get(number, view, max(1, round(view.camera.width / PLACE_PX)))
-            pose = self._view_parameters.cam_from_world(number).detach()
-            K = torch.from_numpy(camera.matrix).to(self._device)
-            with torch.no_grad():
-                color, depth, alpha = as_pictures(*self._draw(pose, K, camera.width, camera.height, None))
-            grey = cv2.cvtColor(target.cpu().numpy(), cv2.COLOR_RGB2GRAY)
-            drawn = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), depth, alpha
-            found = placed(drawn, camera, grey, weight.cpu().numpy(), np.linalg.inv(pose.numpy()))
-            if found.accepted:
-                count += 1
-                self._view_parameters.put(number, inverse(found.world_from_cam))
-        return count
-
     def settle(self) -> None:
         """Make the map what its file shows: colours at the mean exposure, nothing right before a camera."""
         if self.config.exposure:
             gain, bias = self._view_parameters.centre_exposure()
             self._map = self._map.exposed(gain, bias)
-        self._clear_and_limit()
+        self._clear_and_limit(len(self._views))
 
     def extend(self, views: list[View], cloud: StaticCloud) -> None:
         """More views (up to ``max_views``), and seeds from more points, up to half of what the limit leaves free.
@@ -246,19 +225,19 @@ class Mapper:
         self._map = gaps_filled(self._map, [self._views[n] for n in numbers], poses, self._near, room)
         self._adam = RowAdam(self._map.parameters())
 
-    def _sampling(self) -> Sampling:
-        numbers = range(len(self._views))
+    def _sampling(self, most_views: int) -> Sampling:
+        numbers = _evenly(range(len(self._views)), most_views)
         poses = [self._view_parameters.cam_from_world(n).detach().numpy() for n in numbers]
         means = self._map.means.detach().float().cpu().numpy()
-        return sampled(means, [v.camera for v in self._views], poses, self._near)
+        return sampled(means, [self._views[n].camera for n in numbers], poses, self._near)
 
-    def _clear_and_limit(self) -> None:
-        """Remove what stands right before a camera; make nothing finer than the views can tell.
+    def _clear_and_limit(self, most_views: int) -> None:
+        """Remove what stands right before a camera; make nothing finer than so many views can tell.
 
         Floaters love the space before the lens, where hardly another view contradicts them, and what is too fine falls
         apart when a viewer goes closer.
         """
-        sampling = self._sampling()
+        sampling = self._sampling(most_views)
         pixel, keep = torch.from_numpy(sampling.pixel), torch.from_numpy(np.flatnonzero(~sampling.blocks))
         if 0 < len(keep) < len(self._map):
             keep = keep.to(self._device)
@@ -296,7 +275,7 @@ class Mapper:
             self._map.colors.clamp_(0, 1)  # as the file holds them
         if self._policy.due(self._pace.steps, self._pace.done):
             self._map = self._policy.round(self._map, self._adam, camera.width, self._pace.done)
-            self._clear_and_limit()
+            self._clear_and_limit(MAX_VISIBILITIES)
         return float(loss.detach())
 
     def _loss(self, color: torch.Tensor, number: int, shrink: int) -> torch.Tensor:

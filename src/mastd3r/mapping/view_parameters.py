@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from ..geometry.se3 import se3_log
 from ..geometry.sim3 import Sim3
 from ..types import View
 from .adam import RowAdam
@@ -59,11 +58,6 @@ class ViewParameters:
         """Put a pose correction in place of what was learned."""
         for name, value in (("shift", shift), ("turn", turn)):
             self._rows[number][name].data.copy_(torch.from_numpy(np.asarray(value, np.float32)))
-
-    def put(self, number: int, cam_from_world: Array) -> None:
-        """Correct one training view's pose so that it is ``cam_from_world`` (4, 4)."""
-        xi = se3_log(cam_from_world @ np.linalg.inv(self.tracked_cam_from_world(number)))
-        self.correct(number, xi[:3] / self._depth, xi[3:])
 
     def exposed(self, color: torch.Tensor, alpha: torch.Tensor, number: int) -> torch.Tensor:
         """Colour (h, w, 3) over black as that view's exposure shows it: gain * colour + bias * alpha."""
