@@ -116,7 +116,7 @@ def test_the_page_says_how_everything_was_measured() -> None:
         "Sim(3)", "within 20 ms", "every 8th frame", "Whole image unless", "Seeds: 0, 2.", "starts n frames later",
         "coarse: `correction=coarse`, `mapping.enabled=false`", "one run at a time", "Commit abc",
         "LPIPS is not offered",
-        "gone: not in the data folder", "jam--fine--seed0--0: said why", "trained for 3000 steps",
+        "gone: not in the data folder", "jam--fine--seed0--0: said why", "trained for its own steps",
     ):  # fmt: skip
         assert said in text, said
         assert said.replace("`", "") in page, said

@@ -64,12 +64,29 @@ def _images(configs: list[dict[str, Any]]) -> str:
     mapped = [c["mapping"] for c in configs if c["mapping"]["enabled"]]
     if not mapped:
         return "PSNR and SSIM: no map was made."
-    steps, width = _range([m["iterations"] for m in mapped]), _range([m["width_px"] for m in mapped])
+    steps, width = (_given([m[key] for m in mapped]) for key in ("iterations", "width_px"))
+    if all("quality" in m for m in mapped):
+        drawn, quality = (
+            "the splat file alone is drawn over black from the trajectory's pose",
+            f"{_qualities(mapped)}, ",
+        )
+    else:
+        drawn, quality = "rendered from the pose that tracking found, under a fitted exposure", ""
     return (
-        f"PSNR and SSIM: the holdout, every {HOLDOUT_EVERY}th frame, is never shown to the map; rendered from the pose "
-        f"that tracking found, at {width} px width, against the photograph at that size. Whole image unless the head "
-        f"says static pixels, which are those that the true mask leaves. Maps are trained for {steps} steps."
+        f"PSNR and SSIM: the holdout, every {HOLDOUT_EVERY}th frame, is never shown to the map; {drawn}, at {width} px "
+        f"width, against the photograph at that size. Whole image unless the head says static pixels, which are those "
+        f"that the true mask leaves. Maps are {quality}trained for {steps} steps."
     )
+
+
+def _qualities(mapped: list[dict[str, Any]]) -> str:
+    return "of quality " + ", ".join(sorted({m["quality"] for m in mapped}))
+
+
+def _given(values: list[int | None]) -> str:
+    """The range of numbers that were given; what was not is the quality's."""
+    numbers = [v for v in values if v]
+    return _range(numbers) if len(numbers) == len(values) else "its own"
 
 
 def _seeds(results: dict[str, Any]) -> list[str]:
