@@ -107,7 +107,7 @@ class Mapper:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What is not in gaussians.ply and decides how the map looks."""
+        """What run.json says of the map: lengths that its file does not tell, in map units."""
         return {"near": self._near, "median_depth": self._depth}
 
     def refine(self, steps: int, on_step: Callable[[int, float], None] | None = None) -> None:

@@ -5,8 +5,8 @@ blocks is an integer with bit b. The tile is a float32 scratch array, block afte
 in the order of the PLANE constants. Transmittance is kept negative once a pixel is opaque (it would fall to 1e-4 or
 below), or outside the image. Alpha of a pixel = min(0.999, 2^e), e = log2 opacity - log2(e)/2 d^T conic d, cut to 0
 below 1/255. What blending reads of a Gaussian is one row of 16 floats, 64 bytes; the ROW constants name its columns.
-For developers: numba's cache on disk watches only the file of a kernel, so after a change in this file or in
-``simd.py`` remove ``__pycache__/rasterise_cpu_tiles*.nb?``.
+For developers: numba's cache on disk watches only the file of a kernel, so after a change in this file, in
+``simd.py`` or in ``rasterise_cpu_matrices.py`` remove ``__pycache__/rasterise_cpu_*.nb?``.
 """
 
 # mypy: disallow-untyped-defs=False

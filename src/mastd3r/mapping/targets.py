@@ -35,12 +35,6 @@ class Targets:
         image = torch.from_numpy(self._images[number, shrink]).to(self._device)
         return image.float().mul_(1 / 255), self._weights[number, shrink].to(self._device).float()
 
-    def forget(self, shrink: int) -> None:
-        """Let go of one size."""
-        for kept in (self._images, self._weights):
-            for key in [k for k in kept if k[1] == shrink]:
-                del kept[key]  # type: ignore[attr-defined]
-
     def _weight(self, view: View, camera: Camera) -> torch.Tensor:
         c = self._config
         static = torch.from_numpy(smaller_static(view.static, camera))
