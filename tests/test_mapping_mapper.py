@@ -14,7 +14,7 @@ from mastd3r.camera.pinhole import Camera
 from mastd3r.config import MapLossKind, MappingConfig
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.mapping.gaussians import GaussianMap
-from mastd3r.mapping.mapper import LEAST_SIGMA_PX, Mapper
+from mastd3r.mapping.mapper import LEAST_SIGMA_PX, MOST_SIGMA_RATIO, Mapper
 from mastd3r.mapping.seed import seed_gaussians
 from mastd3r.types import StaticCloud, View
 
@@ -165,6 +165,17 @@ def test_no_gaussian_is_finer_than_the_views_can_tell(truth: GaussianMap) -> Non
     mapper.settle()
     smallest_px = mapper.gaussians.scales.min() * CAMERA.fx_px / 3
     assert smallest_px == pytest.approx(LEAST_SIGMA_PX, rel=0.3)
+
+
+def test_what_lies_beside_a_camera_stays_small(truth: GaussianMap) -> None:
+    """A large Gaussian below the camera: some viewers would draw it across the picture."""
+    mapper = trained([view(truth, i) for i in range(6)], steps=20)
+    with torch.no_grad():
+        mapper._map.means[5] = torch.from_numpy(pose(0)[:3, 3] + [0, 1.0, 0.01]).float()
+        mapper._map.log_scales[5] = 0.0
+    mapper.settle()
+    scales = mapper.gaussians.scales[np.abs(mapper.gaussians.means[:, 1] - pose(0)[1, 3] - 1.0).argmin()]
+    assert scales.max() <= MOST_SIGMA_RATIO * 1.01
 
 
 def test_what_the_cloud_leaves_open_is_seeded(truth: GaussianMap) -> None:

@@ -76,3 +76,4 @@ def test_what_views_sample_and_what_stands_in_their_way() -> None:
     seen = sampled(means, [camera, camera], [np.eye(4), back], near=0.3)
     assert seen.pixel[:3] == pytest.approx([2 / 50, 0.1 / 50, 0])
     assert seen.blocks.tolist() == [False, True, False, False]
+    assert seen.distance == pytest.approx([2, 0.1, 4, 13**0.5])

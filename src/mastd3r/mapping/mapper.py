@@ -53,6 +53,7 @@ DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaus
 SH_FROM = 0.4  # of the training; before that, colours do not depend on the direction
 NEAR_RATIO = 1e-3  # of the median depth: nearer than that no viewer draws
 LEAST_SIGMA_PX = 0.2  # standard deviation of the smallest Gaussian, in pixels of the view that sees it largest
+MOST_SIGMA_RATIO = 0.1  # standard deviation of the largest, of the distance to the nearest camera
 MAX_VISIBILITIES = 48  # views that are drawn to see what Gaussians they see
 
 
@@ -232,20 +233,22 @@ class Mapper:
         return sampled(means, [self._views[n].camera for n in numbers], poses, self._near)
 
     def _clear_and_limit(self, most_views: int) -> None:
-        """Remove what stands right before a camera; make nothing finer than so many views can tell.
+        """Remove what stands right before a camera; nothing may be finer than so many views can tell, nor too large.
 
-        Floaters love the space before the lens, where hardly another view contradicts them, and what is too fine falls
-        apart when a viewer goes closer.
+        Floaters love the space before the lens, where hardly another view contradicts them; what is too fine falls
+        apart when a viewer goes closer; and what is large beside a camera, such as the road below it, lies across the
+        picture in viewers that take the projection's slope far outside of the image.
         """
         sampling = self._sampling(most_views)
-        pixel, keep = torch.from_numpy(sampling.pixel), torch.from_numpy(np.flatnonzero(~sampling.blocks))
+        pixel, distance = (torch.from_numpy(a).to(self._device) for a in (sampling.pixel, sampling.distance))
+        keep = torch.from_numpy(np.flatnonzero(~sampling.blocks)).to(self._device)
         if 0 < len(keep) < len(self._map):
-            keep = keep.to(self._device)
-            self._map, pixel = self._map.picked(keep), pixel[keep.cpu()]
+            self._map, pixel, distance = self._map.picked(keep), pixel[keep], distance[keep]
             self._adam.pick(keep, torch.zeros(len(keep), dtype=torch.bool, device=keep.device))
-        least = (LEAST_SIGMA_PX * pixel.to(self._device)).clamp_min(1e-12).log()
+        least = (LEAST_SIGMA_PX * pixel).clamp_min(1e-12).log()[:, None]
+        most = torch.maximum((MOST_SIGMA_RATIO * distance).clamp_min(1e-12).log()[:, None], least)
         with torch.no_grad():
-            self._map.log_scales.copy_(torch.maximum(self._map.log_scales, least[:, None]))
+            self._map.log_scales.copy_(self._map.log_scales.clamp(least, most))
 
     def _draw(
         self,
