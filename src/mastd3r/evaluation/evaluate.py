@@ -239,19 +239,17 @@ def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
     metrics["holdout_frames"] = len(holdout)
     metrics["psnr_holdout"] = float(np.mean([h.psnr_db for h in holdout]))
     metrics["ssim_holdout"] = float(np.mean([h.ssim for h in holdout]))
-    static = [h.psnr_static_db for h in holdout if h.psnr_static_db is not None]
-    if static:
-        metrics["psnr_holdout_static"] = float(np.mean(static))
-    similar = [h.ssim_static for h in holdout if h.ssim_static is not None]
-    if similar:
-        metrics["ssim_holdout_static"] = float(np.mean(similar))
-    for key in ("white_db", "fitted_db", "opaque"):
-        values = [v for h in holdout if (v := getattr(h, key)) is not None]
-        if values:
-            metrics[_SPLAT_KEYS[key]] = float(np.mean(values))
-
-
-_SPLAT_KEYS = {"white_db": "psnr_holdout_white", "fitted_db": "psnr_holdout_fitted", "opaque": "opaque_holdout"}
+    where_known = {
+        "psnr_holdout_static": [h.psnr_static_db for h in holdout],
+        "ssim_holdout_static": [h.ssim_static for h in holdout],
+        "psnr_holdout_white": [h.white_db for h in holdout],
+        "psnr_holdout_fitted": [h.fitted_db for h in holdout],
+        "opaque_holdout": [h.opaque for h in holdout],
+    }
+    for key, values in where_known.items():
+        known = [v for v in values if v is not None]
+        if known:
+            metrics[key] = float(np.mean(known))
 
 
 def _masks(run_dir: Path, stamps: list[str], moving: dict[str, str]) -> MaskError:

@@ -10,7 +10,6 @@ from numba import njit
 from ..concurrency import in_blocks
 from .rasterise_cpu_matrices import JIT
 
-_Tensor = torch.Tensor
 _BETA1, _BETA2, _EPSILON = 0.9, 0.999, 1e-15
 _SMALL = 2**16  # numbers that one thread does sooner than two can be told to
 

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import torch
 
 from ..geometry.inpainting import inpainted_grid
-from ..types import View
+from ..types import StaticCloud, View
 from .gaussians import Array, GaussianMap
-from .seed import START_OPACITY
+from .seed import seed_gaussians
+from .sh import sh_degree
 from .targets import shrunk, smaller_static
 
 LOOK_PX = 160  # width of the pictures in which gaps are looked for
 OPEN_ALPHA = 0.5  # below: nothing stands here
 STRIDE = 2  # one seed a block of this many pixels a side
-SIGMA_OF_BLOCK = 0.6  # standard deviation of a seed as a share of its block
+SPACING_OF_PIXEL = 2.4  # spacing of the seeds over the size of a pixel: they overlap more than points of the cloud
 FAR_PERCENTILE = 95  # of the depths seen: where what has no neighbours is put
 FEW = 4  # blocks; fewer are left to the training
 
@@ -59,18 +58,14 @@ def _seeds_of_gaps(
     z = 1 / np.maximum(filled[blocks[:, 1], blocks[:, 0]], 1e-9)
     points = camera.rays(blocks) * z[:, None]
     world_from_cam = np.linalg.inv(cam_from_world)
-    sigma = SIGMA_OF_BLOCK * STRIDE * z / camera.fx_px
-    tensors = {
-        "means": points @ world_from_cam[:3, :3].T + world_from_cam[:3, 3],
-        "log_scales": np.log(sigma)[:, None].repeat(3, 1),
-        "quats": np.tile([1.0, 0, 0, 0], (len(z), 1)),
-        "opacity_logits": np.full(len(z), np.log(START_OPACITY / (1 - START_OPACITY))),
-        "colors": image[blocks[:, 1], blocks[:, 0]] / 255.0,
-        "sh_rest": np.zeros((len(z), *gaussians.sh_rest.shape[1:])),
-    }
-    leaves = {name: torch.tensor(a, dtype=torch.float32, device=device).requires_grad_() for name, a in tensors.items()}
-    kf_id = torch.full((len(z),), view.kf_id, dtype=torch.int32, device=device)
-    return replace(gaussians, **leaves, kf_id=kf_id)  # type: ignore[arg-type]
+    cloud = StaticCloud(
+        points_world=points @ world_from_cam[:3, :3].T + world_from_cam[:3, 3],
+        colors=image[blocks[:, 1], blocks[:, 0]],
+        confidence=np.ones(len(z), np.float32),
+        spacing=SPACING_OF_PIXEL * z / camera.fx_px,
+        kf_id=np.full(len(z), view.kf_id),
+    )
+    return seed_gaussians(cloud, len(z), 0, str(device), sh_degree(gaussians.sh_rest))
 
 
 def _blocks(gap: Array) -> Array:

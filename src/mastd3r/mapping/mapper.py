@@ -28,7 +28,7 @@ from .sampling import Sampling, sampled
 from .schedule import Pace
 from .screen import ScreenStats
 from .seed import seed_gaussians
-from .splat import as_pictures
+from .splat import NEAR_RATIO, as_pictures
 from .targets import Targets, shrunk
 from .view_parameters import ViewParameters
 
@@ -51,7 +51,6 @@ class TrainingRates:
 SEED_SHARE = 0.3  # of max_gaussians, so that densification has room
 DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaussians move by their anchor
 SH_FROM = 0.4  # of the training; before that, colours do not depend on the direction
-NEAR_RATIO = 1e-3  # of the median depth: nearer than that no viewer draws
 LEAST_SIGMA_PX = 0.2  # standard deviation of the smallest Gaussian, in pixels of the view that sees it largest
 MOST_SIGMA_RATIO = 0.1  # standard deviation of the largest, of the distance to the nearest camera
 MAX_VISIBILITIES = 48  # views that are drawn to see what Gaussians they see

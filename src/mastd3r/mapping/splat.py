@@ -10,6 +10,7 @@ import torch
 from ..camera.pinhole import Camera
 from .gaussians import Array, GaussianArrays, GaussianMap
 
+NEAR_RATIO = 1e-3  # of the median depth: nearer than that no viewer draws
 OPAQUE = 0.5  # alpha above which a pixel has a depth
 
 

@@ -16,10 +16,10 @@ from ..config import Config
 from ..evaluation.image_error import psnr
 from ..export.files import replacing
 from ..export.run_folder import RunFolder
-from ..mapping.mapper import NEAR_RATIO, Mapper
+from ..mapping.mapper import Mapper
 from ..mapping.ply import read_gaussians_ply, write_gaussians_ply
 from ..mapping.process import Outcome
-from ..mapping.splat import Splat
+from ..mapping.splat import NEAR_RATIO, Splat
 from ..mapping.spz import write_gaussians_spz
 from ..progress import Reporter
 from ..types import StaticCloud, View

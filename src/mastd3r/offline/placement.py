@@ -21,6 +21,7 @@ from ..mapping.placing import placed
 from ..mapping.splat import Splat
 from ..types import Frame
 from .final_solve import FinalFrame
+from .smoothing import view_static
 
 Array = NDArray[Any]
 WIDTH_PX = 400  # of the pictures that are aligned
@@ -79,7 +80,7 @@ def _placed(frame: Frame, view: MapView, splat: Splat, pose: Array, masks: Path)
     """World from camera of one photograph, and how far it went (px); None where it could not be aligned."""
     image, inside = view.pinhole_image(frame.as_taken.image)
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255
-    weight = _static(masks / f"{stamp(frame.timestamp_s)}.png", view) * inside
+    weight = _static(masks / f"{stamp(frame.timestamp_s)}.png", inside, view)
     total = 0.0
     for _ in range(2):
         color, depth, alpha = splat.render(pose, view.pinhole)
@@ -93,11 +94,11 @@ def _placed(frame: Frame, view: MapView, splat: Splat, pose: Array, masks: Path)
     return pose, total
 
 
-def _static(mask: Path, view: MapView) -> Array:
-    """(h, w) P(static) where it is above one half, else 0."""
+def _static(mask: Path, inside: Array, view: MapView) -> Array:
+    """(h, w) P(static) where it is above one half, else 0, as where ``inside`` (h, w) is 0."""
     try:
         moving = read_mask(mask).astype(np.float32) / 255
     except InputError:  # a frame without a mask
-        return np.ones((view.pinhole.height, view.pinhole.width), np.float32)
-    static = 1 - view.pinhole_map(cv2.dilate(moving, np.ones((5, 5))))
+        return inside
+    static = view_static(moving, inside, view)
     return np.asarray(static * (static > SURELY_STATIC), np.float32)

@@ -20,9 +20,8 @@ from ..export.read_run import Run, read_run
 from ..export.run_folder import write_depth_png
 from ..export.video import write_video
 from ..geometry.path import smoothed_path
-from ..mapping.mapper import NEAR_RATIO
 from ..mapping.ply import read_gaussians_ply
-from ..mapping.splat import Splat
+from ..mapping.splat import NEAR_RATIO, Splat
 from ..mapping.spz import write_gaussians_spz
 
 Array = NDArray[Any]
