@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from helpers import data_path, write_video
 from mastd3r.cli.main import main
 from mastd3r.config import HOLDOUT_EVERY
+from mastd3r.geometry.upright import down
 from mastd3r.sources.synthetic import make_room_clip
 
 SCORE = Path(__file__).resolve().parents[2] / "shared" / "tools" / "score.py"
@@ -70,6 +71,10 @@ def test_the_room_at_its_usual_size(tmp_path: Path) -> None:
     np.testing.assert_allclose(trajectory[0, 1:4], 0, atol=1e-6)  # the world is the first view's, turned upright
     first = Rotation.from_quat(trajectory[0, 4:]).as_matrix()
     np.testing.assert_allclose(first, record["world"]["upright_from_first"], atol=1e-6)
+    kept = rows(out / "keyframes.txt")
+    poses = np.tile(np.eye(4), (len(kept), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(kept[:, 4:]).as_matrix()
+    np.testing.assert_allclose(down(poses)[0], [0, 1, 0], atol=1e-3)
     assert record["status"] == "complete" and record["camera"]["found"] == "from the video"
     for name in ("config.yaml", "keyframes.txt", "camera.json", "cloud.ply", "report.html"):
         assert (out / name).stat().st_size > 0

@@ -138,8 +138,13 @@ def test_settling_changes_no_picture_of_an_exposed_view(truth: GaussianMap) -> N
         color, _, alpha = (torch.from_numpy(p) for p in mapper.render(pose(2), CAMERA))
         return mapper._view_parameters.exposed(color, alpha, 2).detach()
 
+    with torch.no_grad():  # as if all photographs were darker than the map
+        for row in mapper._view_parameters._rows:
+            row["log_gain"] -= 0.2
     before = shown()
     mapper.settle()
+    log_gains = torch.stack([row["log_gain"].detach() for row in mapper._view_parameters._rows])
+    assert log_gains.mean(0).abs().max() < 1e-6
     assert (shown() - before).abs().mean() < 0.002
 
 
@@ -188,6 +193,22 @@ def test_what_the_cloud_leaves_open_is_seeded(truth: GaussianMap) -> None:
     _, depth, alpha = mapper.render(pose(0), CAMERA)
     assert (alpha > 0.5).mean() > 0.97
     assert np.median(depth[:, 70:]) == pytest.approx(3, rel=0.15)
+
+
+def test_small_images_train_the_same_world(truth: GaussianMap, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trained at a quarter and half of the width alone: at full width nothing is aside, not by half a pixel."""
+    monkeypatch.setattr("mastd3r.mapping.schedule.SMALLEST_PX", 20)
+    config = MappingConfig(iterations=600, max_gaussians=5000)
+    mapper = Mapper(config, wall(1500, 0.03), [view(truth, i) for i in range(12)], seed=0)
+    shrinks = {mapper._pace.shrink}
+    mapper.refine(299, lambda _step, _loss: shrinks.add(mapper._pace.shrink))
+    assert shrinks == {4, 2}
+    drawn, photo = mapper.render(pose(2), CAMERA)[0], photograph(truth, pose(2))
+    aside = [
+        replace(CAMERA, cx_px=CAMERA.cx_px + x, cy_px=CAMERA.cy_px + y) for x, y in ((0.5, 0), (-0.5, 0), (0, 0.5))
+    ]
+    assert psnr(drawn, photo) > 22
+    assert all(psnr(mapper.render(pose(2), camera)[0], photo) < psnr(drawn, photo) - 0.2 for camera in aside)
 
 
 def test_a_training_in_seconds_ends_in_time(truth: GaussianMap) -> None:
