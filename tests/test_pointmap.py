@@ -11,7 +11,6 @@ import pytest
 from numpy.typing import NDArray
 
 from mastd3r.camera.pinhole import Camera
-from mastd3r.features.orb import OrbFeatures
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.pointmap.flow import FlowMatcher, corner_grid
 from mastd3r.pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, sample_own, working_size
@@ -121,30 +120,6 @@ def test_matches_outside_the_new_picture_have_no_weight() -> None:
     px, _ = corner_grid(pair[0], 10)
     found = FlowMatcher(WIDTH, HEIGHT).match(pair[0], pair[1], px, start)
     assert (found.weight[pair[2](px)[:, 0] > WIDTH] == 0).all()
-
-
-def test_features_start_a_jump() -> None:
-    pair = pair_of(turned(np.deg2rad(20)), np.array([45.0, 10.0]))
-    flow = OrbFeatures().flow(pair[0], pair[1], None, None)
-    assert flow is not None
-    truth = pair[2](GRID) - GRID
-    inside = ((pair[2](GRID) > 0) & (pair[2](GRID) < [WIDTH, HEIGHT])).all(-1)
-    assert np.median(np.linalg.norm(flow - truth, axis=-1)[inside]) < 1.5
-    assert OrbFeatures().flow(pair[0], np.full_like(pair[1], 90), None, None) is None
-
-
-def test_features_of_what_moves_have_no_say() -> None:
-    """Something covers 60 % of both pictures and stands still in them, while the rest jumps by 40 px."""
-    ref, new, _ = pair_of(np.eye(2), np.array([40.0, 6.0]))
-    someone, covered = Texture(seed=7).seen_at(GRID), np.zeros((HEIGHT, WIDTH), np.float32)
-    covered[:, : int(0.6 * WIDTH)] = 1
-    ref, new = (np.where(covered > 0, someone, picture) for picture in (ref, new))
-    static = covered == 0
-    for moving, expected in ((covered, [40.0, 6.0]), (None, [0.0, 0.0])):
-        flow = OrbFeatures().flow(ref, new, moving, moving)
-        assert flow is not None
-        assert np.linalg.norm(np.median(flow[static], 0) - expected) < 1.5
-    assert OrbFeatures().flow(ref, new, np.ones_like(covered), np.ones_like(covered)) is None
 
 
 def test_corner_grid_finds_the_corner_of_every_cell() -> None:

@@ -49,9 +49,9 @@ class ToyPointmaps(GeometricPointmaps):
 
 
 class ToyFeatures(OrbFeatures):
-    def flow(self, *given: Any) -> Any:
+    def matches(self, *given: Any) -> Any:
         used("features")
-        return super().flow(*given)
+        return super().matches(*given)
 
 
 class ToyAligner(CoarseToFine):

@@ -14,7 +14,7 @@ from mastd3r.geometry.se3 import inverse, so3_log
 from mastd3r.parts import parts_of
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
-from mastd3r.types import Frame, Guess
+from mastd3r.types import FeatureMatches, Frame, Guess
 from test_pointmap import pair_of
 from test_pointmap_mast3r import FULL, WORK, TrueNetwork, photograph, provider_of
 
@@ -25,7 +25,7 @@ class NoFeatures:
     def __init__(self, allowed: bool) -> None:
         self.allowed, self.asked = allowed, 0
 
-    def flow(self, ref: Any, new: Any, ref_moving: Any, new_moving: Any) -> None:
+    def matches(self, ref: Any, new: Any, ref_moving: Any, new_moving: Any) -> None:
         assert self.allowed, "the network's own matches were not trusted"
         self.asked += 1
 
@@ -73,9 +73,8 @@ def test_where_few_match_features_are_asked_and_the_better_start_is_kept() -> No
     keyframe = slam.graph.keyframes[0]
     still = Future.done(np.zeros((240, 320), np.float32))
     matched = {}
-    for name, flow in (("none", None), ("true", np.float32([-80, 8])), ("wrong", np.float32([60, -60]))):
-        start = None if flow is None else np.tile(flow, (240, 320, 1))
-        parts.features = Given(start)  # type: ignore[assignment]
+    for name, moved in (("none", None), ("true", [-80, 8]), ("wrong", [60, -60])):
+        parts.features = Given(moved)  # type: ignore[assignment]
         work = parts.provider.observe(Frame(1, 0.1, np.dstack([new] * 3)))
         nothing = np.zeros((240, 320, 2), np.float32)  # where a slow camera would be
         matched[name] = slam.two_view.estimate(keyframe, work, still, nothing, np.eye(4)).matched
@@ -106,10 +105,13 @@ def test_before_a_start_what_passes_in_front_makes_no_keyframe() -> None:
 class Given:
     """Features that say what they are told."""
 
-    def __init__(self, flow: Any) -> None:
-        self.answer, self.asked = flow, 0
+    def __init__(self, moved: Any) -> None:
+        x, y = np.meshgrid(np.arange(4.0, 320, 8), np.arange(4.0, 240, 8))
+        px = np.stack([x, y], -1).reshape(-1, 2)
+        self.answer = None if moved is None else FeatureMatches(px, px + moved, np.ones(len(px)))
+        self.asked = 0
 
-    def flow(self, *_: Any) -> Any:
+    def matches(self, *_: Any) -> Any:
         self.asked += 1
         return self.answer
 

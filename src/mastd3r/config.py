@@ -147,7 +147,7 @@ class Config:
     """Everything that decides a run, beside the source itself."""
 
     pointmaps: PointmapKind = "auto"
-    features: FeaturesKind = "orb"  # sparse features, where dense flow ends: after a jump, across a loop
+    features: FeaturesKind = "auto"  # sparse, where dense flow ends: after a jump, across a loop, over wide baselines
     semantics: SemanticsKind = "auto"
     places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"

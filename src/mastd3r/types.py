@@ -99,6 +99,15 @@ class Matches:
 
 
 @dataclass(frozen=True)
+class FeatureMatches:
+    """Places that sparse features found in both views, verified; between them nothing is said."""
+
+    ref_px: Array  # (n, 2) float64 pixels at working size
+    new_px: Array  # (n, 2) float64
+    confidence: Array  # (n,) float64 0..1
+
+
+@dataclass(frozen=True)
 class Guess:
     """What is known of a pair before it is looked at."""
 
@@ -108,6 +117,7 @@ class Guess:
     new_from_ref: Array | None = None  # (4, 4)
     flow: Array | None = None  # (h, w, 2) float32 ref -> new
     flow_is_near: bool = False  # the flow comes from solved poses and depths: only the last pixels are searched
+    features: FeatureMatches | None = None  # where ``flow`` comes from, if it comes from sparse features
 
 
 @dataclass(frozen=True)

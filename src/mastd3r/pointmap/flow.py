@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types import FeatureMatches
+from .feature_matches import around, merged
 from .patches import align_patches, window
 
 Array = NDArray[Any]
@@ -85,7 +87,25 @@ class FlowMatcher:
     def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
         """Patches of ref at ``px`` found in new from a dense start, and back again: (p, 2) pixels, (p,) weight."""
         smooth = cv2.GaussianBlur(flow, (0, 0), SMOOTH_PX)
-        start, affine = _local(smooth, px)
+        return self._patches(ref, new, px, *_local(smooth, px))
+
+    def match_features(
+        self, ref: Array, new: Array, px: Array, texture: Array, start: Array, features: FeatureMatches
+    ) -> FlowResult:
+        """``match`` where sparse features say how far apart the views are; weights count ``texture`` (p,).
+
+        Searched from dense flow that starts at ``start`` (h, w, 2), and once more from the features around each pixel.
+        """
+        flow = self.dense(ref, new, start)
+        by_flow, flow_weight = self.refine(ref, new, px, flow)
+        there, affine, distance = around(features, px)
+        by_feature, feature_weight = self._patches(ref, new, px, there, affine)
+        inside = self._inside(there) & self._inside(px)
+        found = (by_flow, flow_weight * texture), (by_feature, feature_weight * texture)
+        return FlowResult(*merged(*found, there, distance, inside), flow)
+
+    def _patches(self, ref: Array, new: Array, px: Array, start: Array, affine: Array) -> tuple[Array, Array]:
+        """``refine`` from a start (p, 2) and a local warp (p, 2, 2) of each pixel."""
         a, b = ref.astype(np.float32), new.astype(np.float32)
         target, alike = align_patches(a, b, px, start, affine, self._window, ITERATIONS)
         again = np.where(alike[:, None] > LEAST_ALIKE, target, -1.0)  # outside: not looked at

@@ -55,8 +55,13 @@ class GeometricPointmaps(Provider):
 
     def predict(self, ref: WorkFrame, new: WorkFrame, guess: Guess) -> PairPrediction:
         """Match ref's pixels in new, eq. (7); ref's points stand at the depth that is known of them."""
-        found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow, near=guess.flow_is_near)
-        matches = Matches(ref.px, found.target, found.weight * ref.texture)
+        if guess.features is not None and guess.flow is not None:
+            views = ref.gray, new.gray, ref.px, ref.texture
+            found = self.flow.match_features(*views, guess.flow, guess.features)
+            matches = Matches(ref.px, found.target, found.weight)
+        else:
+            found = self.flow.match(ref.gray, new.gray, ref.px, guess.flow, near=guess.flow_is_near)
+            matches = Matches(ref.px, found.target, found.weight * ref.texture)
         ref_map = _known_points(ref.px, guess.camera.rays(ref.px), guess)
         return PairPrediction(matches, ref_map, self._own_points(new, matches, guess.camera), found.dense)
 

@@ -17,8 +17,12 @@ from ..graph.prediction import rigid_flow
 from ..parts import Parts
 from ..pointmap.flow_maps import chained_flow, invert_flow
 from ..types import Guess
+from .two_view import THIN, far_matches, matched_share
 
 Array = NDArray[Any]
+
+
+ENOUGH_SHARE = 0.7  # of a keyframe's points found elsewhere, summed over edges: so many need no sparse features
 
 
 class CovisibilityEdges:
@@ -48,6 +52,7 @@ class CovisibilityEdges:
         self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before, *reversed(recent))])
         for k in reversed(recent):
             self.add(graph, k, kf.id)
+        self._support(graph, kf, (before, *reversed(recent)))
         return recent
 
     def add(self, graph: KeyframeGraph, i: int, j: int) -> bool:
@@ -98,3 +103,45 @@ class CovisibilityEdges:
         if not graph.initialised:
             self.flows[i, j] = pair.flow
         return graph.edge(i, j, pair.matches, static_at(new.moving / 255.0, pair.matches.new_px))
+
+    # -- where flow finds too little -------------------------------------------------------------------------
+
+    def _support(self, graph: KeyframeGraph, kf: Keyframe, pairs: Sequence[int]) -> None:
+        """Edges of a new keyframe from sparse features, nearest first, until enough of it is seen elsewhere."""
+        shares = {k: _share(graph, kf.id, k) for k in pairs}
+        for k in pairs:
+            if sum(shares.values()) >= ENOUGH_SHARE:
+                return
+            if shares[k] < THIN:
+                self._add_far(graph, k, kf.id)
+                shares[k] = max(shares[k], _share(graph, kf.id, k))
+
+    def _add_far(self, graph: KeyframeGraph, i: int, j: int) -> bool:
+        """Edges both ways from sparse features, each in the place of one that there is if it weighs more."""
+        made = [self._far_edge(graph, *ends) for ends in ((i, j), (j, i))]
+        for edge in made:
+            if edge is None:
+                continue
+            at = next((n for n, e in enumerate(graph.edges) if (e.i, e.j) == (edge.i, edge.j)), None)
+            if at is None:
+                graph.edges.append(edge)
+            elif graph.edges[at].weight.sum() < edge.weight.sum():
+                graph.edges[at] = edge
+        return None not in made
+
+    def _far_edge(self, graph: KeyframeGraph, i: int, j: int) -> ReprojectionFactor | None:
+        ref, new = graph.keyframes[i], graph.keyframes[j]
+        moving = new.moving / 255.0
+        far = far_matches(self.parts, ref, new.work, moving)
+        if far is None:
+            return None
+        pair = self.parts.provider.predict(ref.work, new.work, Guess(graph.camera(), flow=far[0], features=far[1]))
+        if not graph.initialised:
+            self.flows[i, j] = pair.flow
+        return graph.edge(i, j, pair.matches, static_at(moving, pair.matches.new_px))
+
+
+def _share(graph: KeyframeGraph, i: int, j: int) -> float:
+    """Share of i's static points that an edge finds in j; 0 without one."""
+    edge = next((e for e in graph.edges if (e.i, e.j) == (i, j)), None)
+    return 0.0 if edge is None else matched_share(graph.keyframes[i], edge.weight)

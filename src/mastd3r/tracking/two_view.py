@@ -17,7 +17,8 @@ from ..config import Config
 from ..dynamics.soft_mask import static_at
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..parts import Parts
-from ..types import USABLE_WEIGHT, Guess, Matches, PairPrediction, WorkFrame
+from ..pointmap.feature_matches import dense_flow, usable
+from ..types import USABLE_WEIGHT, FeatureMatches, Guess, Matches, PairPrediction, WorkFrame
 from .observation import Observation
 from .state import TrackingState
 
@@ -50,7 +51,14 @@ class TwoViewEstimator:
         return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor)
 
     def problem(
-        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, near: bool = True
+        self,
+        ref: Keyframe,
+        new: WorkFrame,
+        prior: Future[Array],
+        flow: Array | None,
+        guess: Array,
+        near: bool = True,
+        far: FeatureMatches | None = None,
     ) -> AlignmentProblem:
         """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
         ``near``: within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
@@ -59,14 +67,15 @@ class TwoViewEstimator:
         inv_depth, info = (variables.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
         known = Guess(graph.camera(), inv_depth, info, guess if started else None)
 
-        def matched(start: Array | None) -> tuple[PairPrediction, Array]:
-            pair = self.parts.provider.predict(ref.work, new, replace(known, flow=start))  # (7): pointmap/geometric.py
+        def matched(start: Array | None, features: FeatureMatches | None = None) -> tuple[PairPrediction, Array]:
+            how = replace(known, flow=start, features=features)
+            pair = self.parts.provider.predict(ref.work, new, how)  # (7): pointmap/geometric.py
             # (5)(6), softly: a match weighs as much as both its ends are static
             return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
-        pair, weight = matched(flow)
-        if near and matched_share(ref, weight) < THIN and (start := self._far_start(ref, new, prior)) is not None:
-            pair, weight = max((pair, weight), matched(start), key=lambda found: float(found[1].sum()))
+        pair, weight = matched(flow, far)
+        if near and matched_share(ref, weight) < THIN and (found := self._far(ref, new, prior)) is not None:
+            pair, weight = max((pair, weight), matched(*found), key=lambda found: float(found[1].sum()))
         sigma = self.parts.provider.depth_sigma_ratio
         if not started:
             return AlignmentProblem(pair, weight, None, guess, sigma)
@@ -84,10 +93,17 @@ class TwoViewEstimator:
         return TwoView(ref, problem.pair, problem.weight, alignment, *motion)
 
     def estimate(
-        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, near: bool = True
+        self,
+        ref: Keyframe,
+        new: WorkFrame,
+        prior: Future[Array],
+        flow: Array | None,
+        guess: Array,
+        near: bool = True,
+        far: FeatureMatches | None = None,
     ) -> TwoView:
         """``problem``, and its coarse, scale and fine stage in order."""
-        problem = self.problem(ref, new, prior, flow, guess, near)
+        problem = self.problem(ref, new, prior, flow, guess, near, far)
         view = self.view(ref, problem, align(self.parts.aligner, problem))
         assert view is not None
         return view
@@ -102,20 +118,27 @@ class TwoViewEstimator:
 
         A provider that finds what is far needs no start; for the others sparse features give one.
         """
-        start = self._far_start(kf, work, prior)
+        start, features = self._far(kf, work, prior) or (None, None)
         if start is None and not self.parts.provider.finds_far:
             return None
-        view = self.estimate(kf, work, prior, start, np.eye(4), near=False)
+        view = self.estimate(kf, work, prior, start, np.eye(4), near=False, far=features)
         return view if self.accepted(view) else None
 
     def _started(self, ref: Keyframe) -> bool:
         return self.graph.submap_of[ref.id] in self.graph.started
 
-    def _far_start(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> Array | None:
-        """Flow from sparse features of the static scene; None where the provider needs none, or too few agree."""
-        if self.parts.provider.finds_far:
-            return None
-        return self.parts.features.flow(kf.work.gray, work.gray, kf.moving / 255.0, prior.get())
+    def _far(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> tuple[Array, FeatureMatches] | None:
+        """Sparse features of the static scene, and flow from them; None where none are needed, or too few agree."""
+        return far_matches(self.parts, kf, work, prior.get())
+
+
+def far_matches(parts: Parts, kf: Keyframe, work: WorkFrame, moving: Array) -> tuple[Array, FeatureMatches] | None:
+    """Sparse features of the static scene in both, and flow from them; None where none are needed, or too few agree."""
+    if parts.provider.finds_far:
+        return None
+    found = parts.features.matches(kf.work.gray, work.gray, kf.moving / 255.0, moving)
+    features = None if found is None else usable(found, *parts.provider.size)
+    return None if features is None else (dense_flow(features, *parts.provider.size), features)
 
 
 def matched_share(ref: Keyframe, weight: Array) -> float:

@@ -1,0 +1,89 @@
+"""Learned features, found, described and matched by networks that are handed in."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..types import FeatureMatches
+from .verification import is_static, of_one_geometry
+
+Array = NDArray[Any]
+MOST_FEATURES = 768  # of an image; those found best
+MIN_MATCHES = 25  # that agree on one geometry
+KEPT_IMAGES, KEPT_PAIRS = 256, 256  # that are remembered: a pair is asked both ways, and again as keyframes
+
+
+class FeatureNetwork(Protocol):
+    """Finds features."""
+
+    def describe(self, image: Array, most: int) -> tuple[Array, Array]:
+        """(n, 2) pixels, best first, and (n, c) float32 descriptors of an image (h, w) uint8."""
+        ...
+
+
+class MatchNetwork(Protocol):
+    """Says which features belong together."""
+
+    def match(
+        self, px: tuple[Array, Array], described: tuple[Array, Array], size: tuple[int, int]
+    ) -> tuple[Array, Array]:
+        """(m, 2) rows and (m,) probability; of pixels, descriptors, and the size (width, height) of both images."""
+        ...
+
+
+class LearnedFeatures:
+    """``load`` gives both networks when features are first wanted: a run that flows well never reads them."""
+
+    def __init__(self, load: Callable[[], tuple[FeatureNetwork, MatchNetwork]]) -> None:
+        self._load = load
+        self._networks: tuple[FeatureNetwork, MatchNetwork] | None = None
+        self._seen: OrderedDict[int, tuple[Array, Array, Array]] = OrderedDict()  # id of an image: it, its features
+        self._pairs: OrderedDict[tuple[int, int], tuple[Any, tuple[Array, Array, Array]]] = OrderedDict()
+        self._one_at_a_time = threading.Lock()  # edges are made beside tracking
+
+    def matches(
+        self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None
+    ) -> FeatureMatches | None:
+        """See ``protocols.FeatureMatcher``."""
+        with self._one_at_a_time:
+            px_ref, px_new = self._described(ref)[0], self._described(new)[0]
+            rows_ref, rows_new, score = self._matched(ref, new)
+        a, b = px_ref[rows_ref].astype(float), px_new[rows_new].astype(float)
+        static = is_static(a, ref_moving) & is_static(b, new_moving)
+        agree = np.flatnonzero(static)[of_one_geometry(a[static], b[static])]
+        return FeatureMatches(a[agree], b[agree], score[agree]) if len(agree) >= MIN_MATCHES else None
+
+    def _networks_loaded(self) -> tuple[FeatureNetwork, MatchNetwork]:
+        if self._networks is None:
+            self._networks = self._load()
+        return self._networks
+
+    def _described(self, image: Array) -> tuple[Array, Array]:
+        key = id(image)
+        if key not in self._seen:
+            found = self._networks_loaded()[0].describe(image, MOST_FEATURES)
+            self._seen[key] = (image, *found)
+            if len(self._seen) > KEPT_IMAGES:
+                self._seen.popitem(last=False)
+        self._seen.move_to_end(key)
+        return self._seen[key][1:]
+
+    def _matched(self, ref: Array, new: Array) -> tuple[Array, Array, Array]:
+        """Rows of both that belong together, and their probability; a pair seen from the other side is the same."""
+        here, back = (id(ref), id(new)), (id(new), id(ref))
+        if back in self._pairs and here not in self._pairs:
+            there, ours, score = self._pairs[back][1]
+            return ours, there, score
+        if here not in self._pairs:
+            (px_ref, d_ref), (px_new, d_new) = self._described(ref), self._described(new)
+            rows, score = self._networks_loaded()[1].match((px_ref, px_new), (d_ref, d_new), ref.shape[::-1])
+            self._pairs[here] = ((ref, new), (rows[:, 0], rows[:, 1], score))
+            if len(self._pairs) > KEPT_PAIRS:
+                self._pairs.popitem(last=False)
+        return self._pairs[here][1]
