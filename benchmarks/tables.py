@@ -2,8 +2,9 @@
 
 usage: python benchmarks/tables.py results.json docs/results.md
 
-Worker results.json: endurance.json, corrections.json, networks.json, reference.json, and in bench/ the results.json
-of each bench under its suite's name. Plots go into a folder plots beside the page.
+Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, stress.json, and in
+bench/ the results.json of each bench under its suite's name. Plots go into a folder plots beside the page, the curve
+of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from map_tables import map_sections
 from masks_tables import masks
 from networks_table import networks
 from splats_table import splats
+from stress_table import PICTURE, stress
 
 COLUMNS: dict[str, tuple[str, str]] = {
     "frames_posed": ("posed", "d"),
@@ -86,6 +88,7 @@ def main() -> int:
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")
     lines += masks(source.parent / "masks.json")
+    lines += stress(source.parent / "stress.json", target.parent / PICTURE)
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
 
