@@ -132,11 +132,38 @@ def test_an_unreadable_frame_in_the_middle(tmp_path: Path, kind: str, damage: st
     bad = folder / ("img3.png" if kind == "images" else "rgb/3.png")
     data = bad.read_bytes()
     bad.write_bytes({"cut": data[: len(data) // 2], "text": b"not an image", "empty": b""}[damage])
-    got = []
-    with pytest.raises(InputError, match=rf"{bad.name}: expected a readable image"):
-        for f in open_source(folder, ALL).frames():
-            got.append(f)
-    assert [f.index for f in got] == [0, 1, 2]
+    source = open_source(folder, ALL)
+    whole, _ = make(tmp_path / "whole", count=5)
+    before = {f.index: f.timestamp_s for f in open_source(whole, ALL).frames()}
+    for _ in range(2):
+        frames = {f.index: f.timestamp_s for f in source.frames()}
+        assert list(frames) == [0, 1, 2, 4] and source.length == 4
+        assert all(frames[i] == before[i] for i in frames)
+        told = f"images that cannot be read are left out: 1 of 5, the first is {bad.name}"
+        assert [n for n in source.notes if "cannot be read" in n] == [told]
+
+
+@pytest.mark.parametrize("kind", ["images", "tum"])
+def test_a_first_frame_that_is_broken_and_all_that_are(tmp_path: Path, kind: str) -> None:
+    make = image_folder if kind == "images" else tum_folder
+    folder, _ = make(tmp_path / "shots", count=3)
+    files = [folder / (f"img{i}.png" if kind == "images" else f"rgb/{i}.png") for i in range(3)]
+    files[0].write_bytes(files[0].read_bytes()[:100])
+    source = open_source(folder, ALL)
+    assert source.size == (64, 48) and [f.index for f in source.frames()] == [1, 2]
+    for path in files[1:]:
+        path.write_bytes(b"not an image")
+    with pytest.raises(InputError, match=rf"{files[0].name}: expected a readable image, .* none of the 3 images"):
+        open_source(folder, ALL)
+
+
+def test_a_broken_depth_file_leaves_its_frame_without(tmp_path: Path) -> None:
+    folder, _ = tum_folder(tmp_path / "seq")
+    bad = folder / "depth" / "2.png"
+    bad.write_bytes(bad.read_bytes()[:60])
+    source = open_source(folder, ALL, want_depth=True)
+    assert [f.depth_m is not None for f in source.frames()] == [True, True, False, True, True]
+    assert "depth files that cannot be read are taken as none: 1, the first is 2.png" in source.notes
 
 
 @pytest.mark.parametrize("kind", ["images", "tum"])

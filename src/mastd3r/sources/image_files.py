@@ -12,23 +12,38 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ..errors import InputError
+from .grey_levels import TOP, WHOLE, GreyRange
 
 Array = NDArray[Any]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 MAP_SUFFIXES = (".png", ".npy")
-_BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
+BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 
 
-def read_rgb(path: Path) -> Array:
-    """An image file as upright (h, w, 3) uint8 RGB. Raises InputError.
+class BrokenFile(InputError):
+    """A file that is there and cannot be read, or not to its end."""
 
-    EXIF orientation is applied; grey is repeated, alpha dropped, 16-bit grey divided by 257.
+
+def read_rgb(path: Path, grey_range: GreyRange = WHOLE) -> Array:
+    """An image file as upright (h, w, 3) uint8 RGB. Raises InputError, its child BrokenFile for a broken file.
+
+    EXIF orientation is applied; grey is repeated, alpha dropped, 16-bit grey brought to 8 bits by ``grey_range``.
     """
     image = _opened(path, "a readable image")
     if image.mode.startswith("I"):  # Pillow's modes of 16-bit grey files
-        grey = _grey_levels(image, path)
-        image = Image.fromarray(grey)
+        image = Image.fromarray(grey_range.as_8_bit(_grey_levels(image, path)))
     return np.array(image.convert("RGB"))  # a copy of its own, writable
+
+
+def read_grey_levels(path: Path) -> Array | None:
+    """(h, w) levels of a 16-bit grey file; None for another kind of image, which is not read, or a broken one."""
+    try:
+        with Image.open(path) as image:
+            if not image.mode.startswith("I"):
+                return None
+        return _grey_levels(_opened(path, "a readable image"), path)
+    except (InputError, *BROKEN):  # who reads it as an image says what is wrong with it
+        return None
 
 
 def read_depth_m(path: Path, units_per_metre: float, none: int | None = None) -> tuple[Array, int]:
@@ -72,16 +87,16 @@ def _opened(path: Path, expected: str) -> Image.Image:
             return ImageOps.exif_transpose(image)
     except FileNotFoundError as e:
         raise InputError(f"{path}: expected {expected}, got no such file") from e
-    except _BROKEN as e:
-        raise InputError(f"{path}: expected {expected}, got a broken or unknown file ({e})") from e
+    except BROKEN as e:
+        raise BrokenFile(f"{path}: expected {expected}, got a broken or unknown file ({e})") from e
 
 
-def _grey_levels(image: Image.Image, path: Path) -> NDArray[np.uint8]:
-    """16-bit grey (modes I;16, I) as 8 bits."""
-    values = np.asarray(image).astype(np.int64)
-    if values.min() < 0 or values.max() > 65535:
-        raise InputError(f"{path}: expected grey levels in 0..65535, got {values.min()} .. {values.max()}")
-    return ((values + 128) // 257).astype(np.uint8)
+def _grey_levels(image: Image.Image, path: Path) -> Array:
+    """Levels of 16-bit grey (modes I;16, I)."""
+    values = np.asarray(image)
+    if values.min() < 0 or values.max() > TOP:
+        raise InputError(f"{path}: expected grey levels in 0..{TOP}, got {values.min()} .. {values.max()}")
+    return values
 
 
 def _map_values(path: Path, expected: str) -> Array:
@@ -92,7 +107,7 @@ def _map_values(path: Path, expected: str) -> Array:
         except FileNotFoundError as e:
             raise InputError(f"{path}: expected {expected}, got no such file") from e
         except (OSError, ValueError, EOFError) as e:
-            raise InputError(f"{path}: expected {expected} as .npy, got a broken file ({e})") from e
+            raise BrokenFile(f"{path}: expected {expected} as .npy, got a broken file ({e})") from e
     else:
         image = _opened(path, expected)
         values = np.asarray(image.convert("L") if image.mode in ("P", "LA", "RGB", "RGBA") else image)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,11 +10,15 @@ from pathlib import Path
 from ..config import SourceConfig
 from ..errors import InputError
 from ..types import Frame, Truth
-from .checks import check_same_size, window
-from .image_files import IMAGE_SUFFIXES, read_probability, read_rgb
+from .beside import beside_frames
+from .checks import window
+from .exif_focal import focal_of
+from .image_files import IMAGE_SUFFIXES, read_probability
 from .notes import Notes
+from .photographs import Photographs
 from .semantic_maps import match_maps
 
+log = logging.getLogger(__name__)
 FOLDER_FPS = 30.0  # image files carry no times; one thirtieth of a second a frame is assumed
 
 
@@ -50,15 +55,15 @@ class ImageFolderSource:
         self.name = folder.resolve().name
         self._notes = Notes()
         self.notes: list[str] = self._notes
-        self._files = image_files(folder)
+        self._files = self._frames_of(image_files(folder))
         if not self._files:
             raise InputError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), got none")
         self._chosen = window(config, len(self._files), str(folder))
         self.length: int | None = len(self._chosen)
-        self._first = self._files[self._chosen[0]]
-        height, width = read_rgb(self._first).shape[:2]
-        self.size = (width, height)
+        self._photographs = Photographs({i: self._files[i] for i in self._chosen}, self._notes)
+        self.size = self._photographs.size
         self._describe()
+        self.focal_hint_px, self.focal_source = focal_of([self._files[i] for i in self._chosen], self.size)
         self._semantic: dict[int, Path] = {}
         if semantic_dir is not None:
             stems = {i: self._files[i].stem for i in self._chosen}
@@ -68,18 +73,31 @@ class ImageFolderSource:
         self._want_semantic = want_semantic
 
     def frames(self) -> Iterator[Frame]:
-        """One image after another. Raises InputError at a file that is unreadable or of another size."""
-        for i in self._chosen:
-            image = read_rgb(self._files[i])
-            check_same_size(image, str(self._files[i]), self.size, str(self._first))
+        """One image after another, broken ones left out and noted. Raises InputError where the size changes."""
+        given = 0
+        for i, image in self._photographs.images():
             semantic = None
             if self._want_semantic and i in self._semantic:
                 semantic = read_probability(self._semantic[i])
+            given += 1
             yield Frame(i, i / FOLDER_FPS, image, semantic=semantic)
+        self.length = given
 
     def truth(self) -> Truth | None:
         """A folder of images knows nothing about itself."""
         return None
+
+    def _frames_of(self, files: list[Path]) -> list[Path]:
+        """The files without what lies beside the frames, which is told aloud."""
+        beside = beside_frames(files)
+        if beside:
+            line = (
+                f"masks or maps beside the frames are left out: {len(beside)}, the first is {beside[0].name}; masks of "
+                "what could move are used with --maps FOLDER"
+            )
+            self._notes.put("beside", line)
+            log.warning("%s: %s", self.name, line)
+        return [p for p in files if p not in set(beside)]
 
     def _describe(self) -> None:
         self._notes.put("times", f"images carry no times: {FOLDER_FPS:g} frames a second assumed")

@@ -11,6 +11,7 @@ import numpy as np
 from ..config import Config
 from ..errors import InputError
 from ..types import Frame, Source
+from .beside import plain_name, without_word
 from .image_files import MAP_SUFFIXES
 from .notes import Notes
 
@@ -35,8 +36,9 @@ def nearest_time(times_s: np.ndarray, wanted_s: np.ndarray, tolerance_s: float =
 def match_maps(folder: Path, stems: Mapping[int, str], times_s: Mapping[int, float], notes: Notes) -> dict[int, Path]:
     """Which file of ``folder`` belongs to which frame index: frame index -> path. Raises InputError.
 
-    Files are .png or .npy, named all in one way: as the frame's own file, by frame index (counted before
-    --start and --stride) or by timestamp in seconds (nearest within 20 ms). ``stems`` may be empty (video).
+    Files are .png or .npy, named all in one way: as the frame's own file, with or without a word such as "mask", by
+    frame index (counted before --start and --stride) or by timestamp in seconds (nearest within 20 ms). ``stems`` may
+    be empty (video). Where some are named with such a word, those alone are maps: the folder may be the frames' own.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of probability maps, got no such folder")
@@ -61,7 +63,9 @@ def match_maps(folder: Path, stems: Mapping[int, str], times_s: Mapping[int, flo
 
 
 def _by_name(files: Mapping[str, Path], stems: Mapping[int, str]) -> tuple[str, dict[int, Path]]:
-    return "file name", {i: files[s] for i, s in stems.items() if s in files}
+    named = {key: p for s, p in files.items() if (key := without_word(s)) is not None}
+    belonging = {i: named[key] for i, s in stems.items() if (key := plain_name(s)) in named}
+    return "file name", belonging or {i: files[s] for i, s in stems.items() if s in files}
 
 
 def _by_index(files: Mapping[str, Path], times_s: Mapping[int, float]) -> tuple[str, dict[int, Path]]:

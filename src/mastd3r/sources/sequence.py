@@ -14,8 +14,9 @@ from ..config import SourceConfig
 from ..errors import InputError
 from ..types import Frame, Truth
 from .checks import check_same_size, window
-from .image_files import read_depth_m, read_probability, read_rgb
+from .image_files import read_depth_m, read_probability
 from .notes import Notes
+from .photographs import BrokenDepth, Photographs
 from .semantic_maps import match_maps
 
 Array = NDArray[Any]
@@ -75,9 +76,8 @@ class SequenceSource:
         check_times([found.frames[i].timestamp_s for i in self._chosen], found.name)
         for i in self._chosen:
             _check_there(found.frames[i].image, "an image")
-        first = found.frames[self._chosen[0]].image
-        height, width = read_rgb(first).shape[:2]
-        self.size, self._first = (width, height), first
+        self._photographs = Photographs({i: found.frames[i].image for i in self._chosen}, self._notes)
+        self.size = self._photographs.size
         self.calibration = calibration_for(self.size, found.lens_size, found.calibration, self._notes)
         self.has_depth = any(found.frames[i].depth is not None for i in self._chosen)
         self._semantic: dict[int, Path] = {}
@@ -88,18 +88,23 @@ class SequenceSource:
         self.has_semantic = bool(self._semantic)
 
     def frames(self) -> Iterator[Frame]:
-        """Frame after frame; depth and semantic only if wanted. Raises InputError at an unreadable file."""
-        for i in self._chosen:
+        """Frame after frame; depth and semantic only if wanted. Broken images and depth are left out and noted.
+
+        Raises InputError at a map that is unreadable, and where the size changes.
+        """
+        given, broken_depth = 0, BrokenDepth(self._notes)
+        for i, image in self._photographs.images():
             listed = self._found.frames[i]
-            image = read_rgb(listed.image)
-            check_same_size(image, str(listed.image), self.size, str(self._first))
             depth, semantic = None, None
             if self._wants.depth and listed.depth is not None:
-                depth, _ = read_depth_m(listed.depth, self._found.units_per_metre, self._found.no_depth)
-                check_same_size(depth, str(listed.depth), self.size, f"its image {listed.image.name}")
+                with broken_depth.noted(listed.depth):
+                    depth, _ = read_depth_m(listed.depth, self._found.units_per_metre, self._found.no_depth)
+                    check_same_size(depth, str(listed.depth), self.size, f"its image {listed.image.name}")
             if self._wants.semantic and i in self._semantic:
                 semantic = read_probability(self._semantic[i])
+            given += 1
             yield Frame(i, listed.timestamp_s, image, depth, semantic)
+        self.length = given
 
     def truth(self) -> Truth | None:
         """Camera poses and focal length; None where the dataset has neither."""

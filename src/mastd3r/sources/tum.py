@@ -18,8 +18,9 @@ from ..config import SourceConfig
 from ..errors import InputError
 from ..types import Frame, Truth
 from .checks import check_same_size, window
-from .image_files import read_depth_m, read_probability, read_rgb
+from .image_files import read_depth_m, read_probability
 from .notes import Notes
+from .photographs import BrokenDepth, Photographs
 from .semantic_maps import match_maps, nearest_time
 from .sequence import calibration_for
 
@@ -75,8 +76,8 @@ class TumSource:
             if not self._image(i).is_file():
                 row = self._rows[i]
                 raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
-        height, width = read_rgb(self._image(self._chosen[0])).shape[:2]
-        self.size = (width, height)
+        self._photographs = Photographs({i: self._image(i) for i in self._chosen}, self._notes)
+        self.size = self._photographs.size
         self.calibration = self._intrinsics() or calibration_for(self.size, lens_size, published, self._notes)
         self._depth = self._associated("depth.txt")
         self._depth_scale = self._units_per_metre() if self._depth else TUM_DEPTH_SCALE
@@ -90,22 +91,25 @@ class TumSource:
         self._want_depth, self._want_semantic = want_depth, want_semantic
 
     def frames(self) -> Iterator[Frame]:
-        """Frame after frame; depth and semantic only if wanted. Raises InputError at an unreadable file."""
-        holes = 0
-        first = str(self._image(self._chosen[0]))
-        for i in self._chosen:
-            image = read_rgb(self._image(i))
-            check_same_size(image, str(self._image(i)), self.size, first)
+        """Frame after frame; depth and semantic only if wanted. Broken images and depth are left out and noted.
+
+        Raises InputError at a map that is unreadable, and where the size changes.
+        """
+        holes, given, broken_depth = 0, 0, BrokenDepth(self._notes)
+        for i, image in self._photographs.images():
             depth, semantic = None, None
             if self._want_depth and i in self._depth:
-                depth, bad = read_depth_m(self._depth[i], self._depth_scale)
-                check_same_size(depth, str(self._depth[i]), self.size, f"its image {self._image(i).name}")
-                holes += bad
-                if bad:
-                    self._notes.put("holes", f"depth: {holes} values that are not finite are taken as none")
+                with broken_depth.noted(self._depth[i]):
+                    depth, bad = read_depth_m(self._depth[i], self._depth_scale)
+                    check_same_size(depth, str(self._depth[i]), self.size, f"its image {self._image(i).name}")
+                    holes += bad
+                    if bad:
+                        self._notes.put("holes", f"depth: {holes} values that are not finite are taken as none")
             if self._want_semantic and i in self._semantic:
                 semantic = read_probability(self._semantic[i])
+            given += 1
             yield Frame(i, float(self._times[i]), image, depth, semantic)
+        self.length = given
 
     def truth(self) -> Truth | None:
         """Poses of groundtruth.txt, masks of mask.txt, focal length of info.json. Raises InputError.

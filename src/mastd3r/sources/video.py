@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ from ..config import SourceConfig
 from ..errors import InputError
 from ..types import Frame, Truth
 from .checks import check_same_size, check_window, window
+from .grey_levels import GreyRange, range_of, spread
 from .image_files import read_probability
+from .interlacing import deinterlaced, interlacing_of
 from .notes import Notes
 from .semantic_maps import match_maps
 
@@ -26,6 +29,8 @@ Array = NDArray[Any]
 Turn = tuple[int, int, int, int]  # row-major 2x2 of 0, 1, -1: (x, y) as stored to (x, y) as shown
 UPRIGHT: Turn = (1, 0, 0, 1)
 FALLBACK_FPS = Fraction(30)
+GREY = "gray16le"
+ATTACHED_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
 @dataclass(frozen=True)
@@ -38,6 +43,7 @@ class _Contents:
     cut_before_s: float | None  # the end that the header promises, where the file stops before it
     doubtful: int | None  # presentation stamp of a last packet that may be only half there
     pixel_aspect: Fraction  # width of a pixel over its height
+    field_order: int  # libavcodec's, 0 where it is unknown
 
 
 @dataclass(frozen=True)
@@ -101,10 +107,16 @@ class VideoSource:
         count = len(self._contents.times_s)
         self._chosen = window(config, count, str(path))
         self.length: int | None = len(self._chosen)
-        first = next(self._decoded(note_end=False), None)
+        head = self._decoded(note_end=False)
+        first = next(head, None)
         if first is None:
             raise InputError(f"{path}: expected a video, got {count} frames of which none can be decoded")
         self._turn = _turn_of_frame(first.frame)
+        frames = (d.frame for d in chain([first], head))
+        self._interlacing = interlacing_of(frames, self._contents.field_order)
+        if self._interlacing is not None:
+            self._notes.put("interlaced", self._interlacing.note)
+        self._grey = self._grey_range() if _is_deep_grey(first.frame) else None
         height, width = self._rgb(first.frame).shape[:2]
         self.size = (width, height)
         self._semantic: dict[int, Path] = {}
@@ -117,7 +129,10 @@ class VideoSource:
     def frames(self) -> Iterator[Frame]:
         """Frame after frame. Broken ones are left out and noted. Raises InputError where the size changes."""
         given = 0
-        for d in self._decoded(note_end=True):
+        decoded: Iterator[_Decoded] = self._decoded(note_end=True)
+        if self._interlacing is not None:
+            decoded = deinterlaced(decoded, self._interlacing)
+        for d in decoded:
             if d.index not in self._chosen:
                 continue
             image = self._rgb(d.frame)
@@ -140,11 +155,23 @@ class VideoSource:
         width = round(frame.width * aspect)
         if width != frame.width:
             self._notes.put("aspect", f"pixels are {aspect} as wide as high: stretched to {width}x{frame.height}")
-            frame = frame.reformat(width=width, height=frame.height, format="rgb24")
-        image: Array = frame.to_ndarray(format="rgb24")
+            frame = frame.reformat(width=width, height=frame.height, format="rgb24" if self._grey is None else GREY)
+        image: Array
+        if self._grey is None:
+            image = frame.to_ndarray(format="rgb24")
+        else:
+            image = np.repeat(self._grey.as_8_bit(frame.to_ndarray(format=GREY))[..., None], 3, axis=2)
         if self._turn != UPRIGHT:
             self._notes.put("turn", "turned upright as the video's rotation metadata says")
         return turned(image, self._turn)
+
+    def _grey_range(self) -> GreyRange | None:
+        """The levels that the window's frames use, by some of them; None where they are read as any other video."""
+        levels = (f.to_ndarray(format=GREY) for f in _frames_at(self._path, self._contents, spread(self._chosen)))
+        found = range_of(levels)
+        if found is not None:
+            self._notes.put("grey", found.note)
+        return None if found is None or found.whole else found
 
     def _decoded(self, note_end: bool) -> Iterator[_Decoded]:
         """All frames that decode whole, from the first of the file to the last of the window.
@@ -225,7 +252,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 def _is_picture(stream: Any) -> bool:
     """Cover art of a sound file, and text that the library would draw, are no video."""
-    return bool(stream.disposition & av.stream.Disposition.attached_pic) or stream.codec_context.name == "ansi"
+    disposition = getattr(stream, "disposition", 0)  # PyAV 14.0 does not tell
+    return bool(disposition & ATTACHED_PICTURE) or stream.codec_context.name == "ansi"
 
 
 def _why_not(path: Path) -> str:
@@ -260,7 +288,8 @@ def _read_contents(path: Path) -> _Contents:
             doubtful = stamps.pop()
             times = _times_of(stamps, stream.time_base, frame_s)
         aspect = stream.sample_aspect_ratio or Fraction(1)
-        return _Contents(times, timed, frame_s, end if cut else None, doubtful, aspect)
+        order = int(getattr(stream.codec_context, "field_order", 0))  # PyAV 14 does not tell
+        return _Contents(times, timed, frame_s, end if cut else None, doubtful, aspect, order)
 
 
 def _times_of(stamps: list[int | None], time_base: Fraction, frame_s: float) -> Array:
@@ -319,6 +348,23 @@ def _frames_and_losses(container: Any, stream: Any, doubtful: int | None) -> Ite
         except av.FFmpegError:
             return
         yield from frames
+
+
+def _is_deep_grey(frame: Any) -> bool:
+    """Whether pixels have one channel of more than 8 bits, of which other videos keep the upper ones."""
+    components = frame.format.components
+    return len(components) == 1 and components[0].bits > 8
+
+
+def _frames_at(path: Path, contents: _Contents, indices: list[int]) -> Iterator[Any]:
+    """A decoded frame near each index: the key frame before it, where the container can be searched."""
+    with _opened(path) as (container, stream):
+        for at_s in contents.times_s[indices]:
+            try:
+                container.seek(int(at_s / stream.time_base), stream=stream)
+                yield next(container.decode(stream))
+            except (av.FFmpegError, StopIteration):
+                continue
 
 
 def _turn_of_frame(frame: Any) -> Turn:
