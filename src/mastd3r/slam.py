@@ -87,7 +87,7 @@ class Slam:
         self.parts = parts if parts is not None else build_parts(self.config, seen)
         self.map_device = chosen_map_device(self.config.mapping, self.parts.notes)
         self.config = with_map_effort(self.config, self.source.size, self.map_device, self.parts.notes)
-        self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen.size)
+        self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
         self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)
         self.recovery = Recovery(self.parts, self.graph, self.two_view, self.keyframes)
@@ -243,13 +243,19 @@ def _recorded(config: Config, size: tuple[int, int]) -> RecordedSource:
     return RecordedSource((int(size[0]), int(size[1])), has_depth=depth, has_semantic=maps)
 
 
-def _empty_graph(config: Config, parts: Parts, rectifier: Rectifier | None, size: tuple[int, int]) -> KeyframeGraph:
-    """A graph without keyframes, with a lens; where photographs are rectified that is the pinhole."""
+def _empty_graph(config: Config, parts: Parts, rectifier: Rectifier | None, source: Source) -> KeyframeGraph:
+    """A graph without keyframes, with a lens; where photographs are rectified that is the pinhole.
+
+    A focal length that the source only hints at is where the lens starts, which goes to the notes.
+    """
     camera = config.camera
     if rectifier is not None:
         c = rectifier.pinhole
         camera = replace(camera, intrinsics=(c.fx_px, c.fy_px, c.cx_px, c.cy_px))
     width, height = parts.provider.size
-    graph = KeyframeGraph(config.graph, intrinsics_for(camera, width, height, size))
+    hint_px: float | None = None if camera.intrinsics else getattr(source, "focal_hint_px", None)
+    if hint_px is not None:
+        parts.notes.append(f"focal length starts at {getattr(source, 'focal_source', 'a hint')} ({hint_px:.0f} px)")
+    graph = KeyframeGraph(config.graph, intrinsics_for(camera, width, height, source.size, hint_px))
     graph.size = parts.provider.size
     return graph

@@ -49,7 +49,11 @@ class Truth:
 
 
 class Source(Protocol):
-    """A re-iterable stream of frames: ``frames()`` may be called again and starts from the beginning."""
+    """A re-iterable stream of frames: ``frames()`` may be called again and starts from the beginning.
+
+    It may have ``focal_hint_px``, the focal length at full width where something speaks of it (EXIF), else None, and
+    ``focal_source``, in words what does. The lens starts there, and is still found from the frames.
+    """
 
     name: str
     kind: str  # "video", "images", or the kind of a dataset's layout: config.SourceKind

@@ -28,6 +28,7 @@ SAME = 0.01  # starts whose focal lengths and costs differ by less came to the s
 FITS_PX = 1.0  # a match further away counts as left out
 FOCAL_DOUBT = 0.1  # share of the matches that a focal length e times the usual one must explain more than the others
 FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the intrinsics are not given
+FOCAL_RATIOS_AROUND = (1.0, 0.85, 1.2)  # of the focal length that EXIF says, tried where it does
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def bootstrap(whole: KeyframeGraph) -> bool:
     log.info(
         "started with %d keyframes, focal %.0f px at working size",
         len(graph.keyframes),
-        np.exp(graph.intrinsics.values[0]),
+        _focal_px(graph),
     )
     return True
 
@@ -86,14 +87,14 @@ def _given(intrinsics: Intrinsics) -> Intrinsics:
 def _starts(graph: KeyframeGraph) -> Iterator[_Start]:
     """Every start that comes to an end, those that come to the same one once."""
     known = graph.intrinsics
-    ratios = FOCAL_RATIOS if known.free[0] else (None,)
+    focals = first_focals(graph)
     ends: list[tuple[float, float]] = []
     for pair in _first_pairs(graph):
         same = 0
-        for ratio in ratios:
+        for focal_px in focals:
             first = known.prior.copy()
-            if ratio is not None:
-                first[0] = np.log(ratio * np.sqrt(graph.size[0] * graph.size[1]))
+            if focal_px is not None:
+                first[0] = np.log(focal_px)
             graph.set_intrinsics(replace(known, values=first))
             cost = _attempt(graph, pair)
             if cost is None:
@@ -104,12 +105,25 @@ def _starts(graph: KeyframeGraph) -> Iterator[_Start]:
                 continue
             ends.append((log_focal, cost))
             left_out = _settle_on_most(graph)
-            focal_px = np.exp(graph.intrinsics.values[0])
-            log.info("start from %d-%d: focal %.0f px, cost %.0f", pair.i, pair.j, focal_px, left_out)
+            log.info("start from %d-%d: focal %.0f px, cost %.0f", pair.i, pair.j, _focal_px(graph), left_out)
             state = {k: (v.cam_from_world, v.inv_depth) for k, v in graph.variables.items()}
             yield _Start(left_out, graph.intrinsics, state)
-        if len(ends) == 1 and same == len(FOCAL_RATIOS) - 1:
+        if len(focals) > 1 and len(ends) == 1 and same == len(focals) - 1:
             return  # there is no other
+
+
+def first_focals(graph: KeyframeGraph) -> list[float | None]:
+    """Focal lengths in working pixels to start from; None alone where it is known."""
+    known = graph.intrinsics
+    if not known.free[0]:
+        return [None]
+    if known.focal_source == "EXIF":
+        return [ratio * float(np.exp(known.prior[0])) for ratio in FOCAL_RATIOS_AROUND]
+    return [ratio * float(np.sqrt(graph.size[0] * graph.size[1])) for ratio in FOCAL_RATIOS]
+
+
+def _focal_px(graph: KeyframeGraph) -> float:
+    return float(np.exp(graph.intrinsics.values[0]))
 
 
 def _settle_on_most(graph: KeyframeGraph) -> float:

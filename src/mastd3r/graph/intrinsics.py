@@ -22,6 +22,7 @@ class Intrinsics:
     values: Array  # (6,)
     prior: Array  # (6,)
     prior_info: Array  # (6,) 1/variance in px^-2 units; inf = fixed
+    focal_source: str = "assumed"  # where the prior's focal length comes from: "given", "EXIF" or "assumed"
 
     @property
     def free(self) -> Array:
@@ -30,6 +31,7 @@ class Intrinsics:
 
 
 PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
+EXIF_FOCAL_SIGMA = 0.05  # of its log, where EXIF tells it: equivalents are in whole mm, lenses focus and are corrected
 PRIOR_RADIAL_SIGMA = (0.05, 0.1, 0.1)  # of k, m, n
 PRIOR_CENTRE_SIGMA = 0.02  # of the principal point from the image's centre / width
 RADIAL, HELD_AT_FIRST = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms; what waits for lens_keyframes
@@ -59,9 +61,12 @@ def inverse_radial(focal_px: float, terms: tuple[float, ...], size: tuple[int, i
     return tuple(float(v) for v in (*found, 0.0, 0.0))[:3]
 
 
-def intrinsics_for(camera: CameraConfig, width: int, height: int, full_size: tuple[int, int]) -> Intrinsics:
+def intrinsics_for(
+    camera: CameraConfig, width: int, height: int, full_size: tuple[int, int], focal_hint_px: float | None = None
+) -> Intrinsics:
     """Intrinsics before anything is seen: fixed where they are given, otherwise centred with wide priors.
 
+    focal_hint_px: the focal length that photographs say in EXIF, pixels of the full size; the prior is narrow then.
     The optimisation knows one focal length, so fx and fy are joined by their geometric mean.
     """
     if camera.intrinsics:
@@ -71,12 +76,15 @@ def intrinsics_for(camera: CameraConfig, width: int, height: int, full_size: tup
         k1 = camera.intrinsics[4] if len(camera.intrinsics) > 4 else 0.0
         k, m, n = inverse_radial(f, (k1, 0.0, 0.0), (width, height))
         g = np.array([np.log(f), k, c.cx_px, c.cy_px, m, n])
-        return Intrinsics(g, g.copy(), np.full(N_GLOBAL, np.inf))
-    focal = PRIOR_FOCAL_RATIO * np.sqrt(width * height)
+        return Intrinsics(g, g.copy(), np.full(N_GLOBAL, np.inf), "given")
+    focal, focal_sigma, focal_source = PRIOR_FOCAL_RATIO * np.sqrt(width * height), PRIOR_FOCAL_SIGMA, "assumed"
+    if focal_hint_px is not None:
+        focal = focal_hint_px * np.sqrt(width * height / (full_size[0] * full_size[1]))
+        focal_sigma, focal_source = EXIF_FOCAL_SIGMA, "EXIF"
     g = np.array([np.log(focal), 0.0, (width - 1) / 2, (height - 1) / 2, 0.0, 0.0])
     centre = PRIOR_CENTRE_SIGMA * width
-    sigma = np.array([PRIOR_FOCAL_SIGMA, PRIOR_RADIAL_SIGMA[0], centre, centre, *PRIOR_RADIAL_SIGMA[1:]])
+    sigma = np.array([focal_sigma, PRIOR_RADIAL_SIGMA[0], centre, centre, *PRIOR_RADIAL_SIGMA[1:]])
     info = PRIOR_GAIN / sigma**2
     if not camera.estimate_radial:
         info[1:] = np.inf
-    return Intrinsics(g, g.copy(), info)
+    return Intrinsics(g, g.copy(), info, focal_source)

@@ -124,8 +124,13 @@ class KeyframeGraph:
     # -- growing and shrinking -------------------------------------------------------------------------------
 
     def believe_focal(self, focal_px: float | None) -> None:
-        """Start the lens at a focal length that a frame's own points speak of, where a camera may have it."""
+        """Start the lens at a focal length that a frame's own points speak of, where a camera may have it.
+
+        What EXIF says goes before it.
+        """
         low, high = FOCAL_RATIOS_BELIEVED
+        if self.intrinsics.focal_source == "EXIF":
+            return
         if focal_px is None or not low < focal_px / np.sqrt(self.size[0] * self.size[1]) < high:
             return
         values = np.concatenate([[np.log(focal_px)], self.intrinsics.values[1:]])

@@ -45,6 +45,8 @@ def focal_of_file(path: Path, size: tuple[int, int]) -> tuple[float, str] | None
     """
     try:
         with Image.open(path) as image:
+            if image.format == "PNG" and "exif" not in image.info:
+                return None  # Pillow would decode the image to look behind it
             exif = image.getexif().get_ifd(EXIF_IFD)
     except BROKEN:
         return None
