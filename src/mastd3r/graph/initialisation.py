@@ -18,15 +18,19 @@ from .depth import carried
 from .factors import ReprojectionFactor
 from .intrinsics import Intrinsics
 from .keyframe_graph import KeyframeGraph
+from .observability import explained_by_turn
+from .turning import observed
 from .windows import ALL_INTRINSICS, Window
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_AGREEMENT = 0.4  # of the matches, for a start to be accepted
+LOOKED_AT = 8  # latest keyframes whose image motion must show parallax, before anything is tried
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 SAME = 0.01  # starts whose focal lengths and costs differ by less came to the same end
 FITS_PX = 1.0  # a match further away counts as left out
 FOCAL_DOUBT = 0.1  # share of the matches that a focal length e times the usual one must explain more than the others
+WITHOUT_PARALLAX = {"none": "that stands still", "rotation": "that only turns"}
 FOCAL_RATIOS = (0.7, 0.95, 1.2, 1.5, 2.0)  # focal / sqrt(width * height), tried when the intrinsics are not given
 FOCAL_RATIOS_AROUND = (1.0, 0.85, 1.2)  # of the focal length that EXIF says, tried where it does
 
@@ -43,14 +47,24 @@ class _Start:
 def bootstrap(whole: KeyframeGraph) -> bool:
     """Solve all keyframes of the submap being tracked. False where no start was found (too little parallax).
 
+    As long as there is no map at all, keyframes between which the camera stands still, or only turns, are not tried:
+    a start would be found, and mean nothing (graph/observability.py).
+
     Several first pairs and focal lengths are tried, each to the end; the start that explains the most matches is
     kept, and matches that it leaves out lose their weight: nothing else tells yet what moves. World is the submap's
     first keyframe's camera. Intrinsics that an earlier submap has found stay as they are.
     """
     graph = whole.part()
+    turns: set[tuple[int, int]] = set()
     if whole.started:
         graph.set_intrinsics(_given(whole.intrinsics))
-    best = min(_starts(graph), key=lambda start: start.cost, default=None)
+    else:
+        seen, pairs = observed(graph, graph.members()[-LOOKED_AT:])
+        if seen.kind in ("none", "rotation"):
+            log.info("no start: the image motion is that of a camera %s", WITHOUT_PARALLAX[seen.kind])
+            return False
+        turns = {(p.ref, p.new) for p in pairs if explained_by_turn(p, seen.noise_px, graph.size)}
+    best = min(_starts(graph, turns), key=lambda start: start.cost, default=None)
     if best is None:
         return False
     graph.set_intrinsics(best.intrinsics)
@@ -84,12 +98,12 @@ def _given(intrinsics: Intrinsics) -> Intrinsics:
     return Intrinsics(intrinsics.values, intrinsics.values, np.full(N_GLOBAL, np.inf))
 
 
-def _starts(graph: KeyframeGraph) -> Iterator[_Start]:
-    """Every start that comes to an end, those that come to the same one once."""
+def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> Iterator[_Start]:
+    """Every start that comes to an end, those that come to the same one once; not from pairs that are ``turns``."""
     known = graph.intrinsics
     focals = first_focals(graph)
     ends: list[tuple[float, float]] = []
-    for pair in _first_pairs(graph):
+    for pair in _first_pairs(graph, turns):
         same = 0
         for focal_px in focals:
             first = known.prior.copy()
@@ -177,15 +191,15 @@ def _agreement(graph: KeyframeGraph) -> float:
     return close / max(sum(int(u.sum()) for u in used), 1)
 
 
-def _first_pairs(graph: KeyframeGraph) -> list[ReprojectionFactor]:
-    """Pairs to start from: many matches and much image motion, best first."""
+def _first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[ReprojectionFactor]:
+    """Pairs to start from: many matches and much image motion, best first; ``turns`` say nothing of depth."""
 
     def merit(edge: ReprojectionFactor) -> float:
         used = edge.weight > USABLE_WEIGHT
         moved = np.linalg.norm(edge.target - graph.variables[edge.i].px, axis=1)[used]
         return float(used.sum() * min(np.median(moved) / (0.05 * max(graph.size)), 1.5))
 
-    forward = [e for e in graph.edges if e.i < e.j]
+    forward = [e for e in graph.edges if e.i < e.j and (e.i, e.j) not in turns]
     return sorted(forward, key=merit, reverse=True)[:FIRST_PAIRS]
 
 
