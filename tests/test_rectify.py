@@ -373,8 +373,9 @@ def test_renders_are_photographs_of_the_bent_lens(track: Callable[..., Path], cl
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        ({"found": "from the video", "focal_sigma_ratio": 0.004}, ["527.9 px ± 0.4 %", "(1σ if match errors were in"]),
+        ({"found": "from the video", "focal_sigma_ratio": 0.004}, ["527.9 px ± 0.4 %", "width, from the video (1σ)"]),
         ({"found": "from the video", "focal_sigma_ratio": 0.123}, ["527.9 px ± 12 %"]),
+        ({"found": "assumed", "focal_sigma_ratio": 0.25}, ["527.9 px ± 25 %", "width, assumed (1σ of most cameras)"]),
         ({"found": "from the video", "focal_sigma_ratio": 1e-6}, ["527.9 px ± under 0.01 %"]),
         ({"found": "from the video", "focal_sigma_ratio": None}, ["527.9 px<"]),
         ({"found": "given", "focal_sigma_ratio": None}, ["527.9 px<", "Focal length at full width, given"]),

@@ -69,6 +69,8 @@ def _run_and_show(
 
     reporter = Silent() if quiet else Terminal(console)
     result = reconstruct(source, out, config, maps=maps, command=words, reporter=reporter)
+    if result.observability.get("said"):
+        Console().print(f"[bold]{result.observability['said']}[/bold]", soft_wrap=True)
     Console().print(_table(result.metrics))
     Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]", soft_wrap=True)
     return 0

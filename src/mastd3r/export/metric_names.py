@@ -34,6 +34,7 @@ NAMES: dict[str, tuple[str, str, str]] = {
     "peak_rss_mib": ("Peak memory", ".0f", "MiB"),
     "peak_gpu_mib": ("Peak memory of the accelerator", ".0f", "MiB"),
     "focal_px": ("Focal length at full width", ".1f", "px"),
+    "focal_sigma_ratio": ("Focal length, 1 sigma", ".1%", ""),
     "gaussians": ("Gaussians", ",d", ""),
     "cloud_mib": ("Size of cloud.ply", ".2f", "MiB"),
 }

@@ -19,6 +19,7 @@ from .run_folder import stamp
 from .trajectory_files import read_tum
 
 Array = NDArray[Any]
+NOT_OF_THE_LENS = ("found", "focal_sigma_ratio")  # of camera.json
 
 
 @dataclass(frozen=True)
@@ -102,7 +103,7 @@ def _camera(path: Path) -> tuple[Camera, tuple[float, ...]]:
     data = read_json(path)
     try:
         distortion = tuple(float(v) for v in data.pop("distortion", []))
-        return Camera(**data), distortion
+        return Camera(**{k: v for k, v in data.items() if k not in NOT_OF_THE_LENS}), distortion
     except (TypeError, ValueError) as e:
         raise InputError(f"{path}: expected the fields of a camera, got {e}") from e
 

@@ -90,10 +90,11 @@ def report_html(data: ReportData) -> str:
 
 
 def _banner(record: Mapping[str, Any]) -> str:
-    if record.get("status") != "incomplete":
-        return ""
-    reason = escape(str(record.get("reason") or "no reason recorded"))
-    return f'<p class="banner"><b>Incomplete run.</b> {reason}</p>'
+    said = (record.get("observability") or {}).get("said")
+    lines = [] if not said else [escape(str(said))]
+    if record.get("status") == "incomplete":
+        lines.append(f"<b>Incomplete run.</b> {escape(str(record.get('reason') or 'no reason recorded'))}")
+    return "".join(f'<p class="banner">{line}</p>' for line in lines)
 
 
 def _section(title: str, text: str, body: str) -> str:
@@ -204,7 +205,7 @@ def _value_cell(key: str, value: Any, addition: str = "") -> str:
 def _of_focal(camera: Mapping[str, Any]) -> tuple[str, str]:
     """What is added to the focal length's name and value, from the camera section of run.json.
 
-    The solver's sigma counts every match as independent noise of one pixel, and is named as such.
+    An assumed one is what most cameras have: the video hardly speaks of it.
     """
     sigma_ratio = camera.get("focal_sigma_ratio")
     if camera.get("found") == "given":
@@ -213,7 +214,8 @@ def _of_focal(camera: Mapping[str, Any]) -> tuple[str, str]:
         return "", ""
     percent = 100 * sigma_ratio
     digits = "under 0.01" if percent < 0.01 else f"{percent:.2g}" if percent < 10 else f"{percent:.0f}"
-    return " (1σ if match errors were independent)", f" ± {digits} %"
+    said = ", assumed (1σ of most cameras)" if camera.get("found") == "assumed" else ", from the video (1σ)"
+    return said, f" ± {digits} %"
 
 
 def _timings(timings_s: Mapping[str, float]) -> str:

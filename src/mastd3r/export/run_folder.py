@@ -97,14 +97,15 @@ class RunFolder:
         states = [state for state, pose in pairs if np.isfinite(pose).all()]
         self.update(states=_run_lengths(states))
 
-    def write_camera(self, camera: Camera, distortion: Sequence[float] | None = None) -> None:
+    def write_camera(self, camera: Camera, distortion: Sequence[float] | None = None, **known: Any) -> None:
         """camera.json: the lens, in pixels of the full-size image, and its distortion in OpenCV's order.
 
         ``distortion`` holds what ``camera`` cannot (k1 k2 p1 p2 [k3 [k4 k5 k6]]); without it, the camera's own terms.
+        ``known``: what else is said of it, such as where the focal length comes from (read_run.py:NOT_OF_THE_LENS).
         """
         own = (camera.k1, camera.k2, 0.0, 0.0, camera.k3)
         distorted = list(own if distortion is None else distortion)
-        self.write_json("camera.json", {**dataclasses.asdict(camera), "distortion": distorted})
+        self.write_json("camera.json", {**dataclasses.asdict(camera), "distortion": distorted, **known})
 
     def write_cloud(self, cloud: StaticCloud) -> None:
         """cloud.ply: the dense static map."""

@@ -13,9 +13,12 @@ from ..alignment.reproject import StaticMatches, solve_pose
 from ..config import Config
 from ..errors import InputError
 from ..geometry.se3 import interpolate, inverse
+from ..graph.bundle_adjustment import SolveReport
 from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
+from ..graph.observability import Observability
 from ..graph.submaps import bridge_submaps
+from ..graph.turning import observed, put_at_infinity
 from ..types import State, Trajectory
 
 Array = NDArray[Any]
@@ -31,26 +34,43 @@ class FinalFrame:
     state: State
 
 
-def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = True) -> bool:
-    """Start what never started, then optimise everything. False where nothing ever started.
+def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = True) -> Observability | None:
+    """Start what never started, then optimise everything; what the matches let be known, None where nothing started.
 
-    ``needs_motion``: depth comes from the camera's motion; InputError is raised for one that never moves.
+    ``needs_motion``: depth comes from the camera's motion. InputError is raised for one that never moves; where it
+    only turns, all points end at infinity and all keyframes at one place. Of several submaps one may do so.
     """
-    if not graph.started and (len(graph.members()) < 2 or not bootstrap(graph)):
-        if not needs_motion:
-            return False
+    started = bool(graph.started) or (len(graph.members()) >= 2 and bootstrap(graph))
+    if not needs_motion and not started:
+        return None
+    report = _solve(graph, config) if started else None
+    seen, _ = observed(graph, graph.members())
+    if needs_motion and len(graph.roots()) == 1:
+        if seen.kind == "none":
+            raise InputError(
+                f"the camera never moves: expected one that changes its place, got {seen.still_ratio:.0%} of the "
+                f"matches, spread over the whole image, that stay where they are, and things that move by themselves, "
+                f"in {len(graph.records)} frames; no depth can be found"
+            )
+        if seen.kind == "rotation":
+            put_at_infinity(graph)
+            report = _solve(graph, config)
+    if report is None:
         raise InputError(
             f"the camera never moves enough: expected image motion of at least "
             f"{config.tracking.first_motion_ratio:.0%} of the image with parallax, got "
             f"{len(graph.keyframes)} view(s) apart in {len(graph.records)} frames; no depth can be found"
         )
-    graph.solve_all(config.graph.final_iterations // 2, 1.0)
-    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
     for first, last in bridge_submaps(graph):
         log.warning("frames %d to %d were never joined to the rest: placed by continuity", first, last)
     log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
              len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
-    return True
+    return seen
+
+
+def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
+    graph.solve_all(config.graph.final_iterations // 2, 1.0)
+    return graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
 
 
 def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
@@ -119,7 +139,7 @@ def trajectory_of(frames: list[FinalFrame]) -> Trajectory:
     """All frames as a trajectory."""
     return Trajectory(
         np.array([f.record.timestamp_s for f in frames]),
-        np.stack([f.world_from_cam for f in frames]) if frames else np.zeros((0, 4, 4)),
+        np.stack([f.world_from_cam for f in frames]) + 0.0 if frames else np.zeros((0, 4, 4)),  # no -0 in files
         tuple(f.state for f in frames),
         np.array([f.record.is_keyframe for f in frames], bool),
     )

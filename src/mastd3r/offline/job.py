@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import TracebackType
 from typing import Any
 
@@ -26,6 +26,8 @@ from ..export.mask_video import MaskVideo
 from ..export.run_folder import RunFolder
 from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
+from ..graph.focal_sigma import focal_knowledge
+from ..graph.intrinsics import PRIOR_FOCAL_SIGMA
 from ..graph.keyframe_graph import KeyframeGraph
 from ..mapping.process import Outcome
 from ..mapping.rasterise import accelerator
@@ -43,6 +45,7 @@ from .static_cloud import static_cloud
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+TURNS_ONLY = "the camera only turns: rotations and the lens are found, no depth, no translation, no map"
 NO_MAP_PX = 64  # width of the map's images where there is no map, which nothing is drawn in
 
 
@@ -84,6 +87,7 @@ class RunJob:
         self.timings: dict[str, float] = {}
         self._began = time.perf_counter()
         self._final: list[FinalFrame] = []
+        self._turns_only = False  # the camera has one place: there is no depth
         self._evidence: EvidenceSample | None = None  # of the frame that shows most
         realtime = self.config.mapping.enabled and self.config.mapping.realtime
         self._live = LiveMap(self.config, tracked.map_device) if realtime else None
@@ -121,7 +125,14 @@ class RunJob:
         """The joint optimisation over everything, and every frame's pose from it."""
         graph, provider = self.graph, self.tracked.parts.provider
         with self.timed("joint optimisation"):
-            if not finish_graph(graph, self.config, needs_motion=provider.depth_sigma_ratio is None):
+            seen = finish_graph(graph, self.config, needs_motion=provider.depth_sigma_ratio is None)
+            self._turns_only = seen is not None and seen.kind == "rotation" and provider.depth_sigma_ratio is None
+            if seen is not None:
+                said = TURNS_ONLY if self._turns_only else None
+                self.folder.update(observability={**asdict(seen), "said": said})
+            if self._turns_only:
+                self.folder.note(TURNS_ONLY)
+            if seen is None:
                 self.folder.note(
                     f"pointmaps {provider.name}: no depth was measured, no frame could be followed; every frame is "
                     "given one pose, and neither path, cloud nor map mean anything"
@@ -149,14 +160,16 @@ class RunJob:
                 self._final = seen.reweighting.poses(self.graph)
                 self._write_trajectory()
                 seen = seen.with_poses(self._final)
-        cloud = static_cloud(self.graph, seen.colors, seen.moving)
-        self.folder.write_cloud(cloud)
+        colors = {} if self._turns_only else seen.colors
+        cloud = static_cloud(self.graph, colors, seen.moving)
+        if not self._turns_only:
+            self.folder.write_cloud(cloud)
         return MapMaterial(cloud, seen, map_view)
 
     def make_map(self, material: MapMaterial) -> None:
         """The Gaussian map, its renders of the holdout frames, and the flight through it."""
         cloud, views = material.cloud, material.seen.views
-        if not self.config.mapping.enabled:
+        if not self.config.mapping.enabled or self._turns_only:
             return
         if not views or not len(cloud.points_world):
             self.folder.note(f"no map: {len(views)} frames can show it, {len(cloud.points_world)} points start it")
@@ -214,6 +227,8 @@ class RunJob:
             "fps_total": self.frames / elapsed,
             "peak_rss_mib": peak_rss_mib(),
         }
+        if (sigma_ratio := self.folder.record["camera"]["focal_sigma_ratio"]) is not None:
+            self.metrics["focal_sigma_ratio"] = sigma_ratio
         if (card := accelerator()) is not None:
             self.folder.update(accelerator=card[0])
             self.metrics["peak_gpu_mib"] = card[1]
@@ -281,17 +296,15 @@ class RunJob:
         self.folder.write_trajectory(trajectory_of(self._final))
         lens = self.tracked.lens()
         camera = lens.radial if isinstance(lens, OpenCvLens) else lens
-        self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None)
-        report = graph.last_report
-        sigma = report.focal_sigma_ratio if report is not None else None
+        focal = self._focal()
+        self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None, **focal)
         lost = [f for f in self._final if f.state == "interpolated"]
         facts: dict[str, Any] = {
             "focal_px": _focal_px(lens),
-            "focal_sigma_ratio": sigma if sigma is not None and np.isfinite(sigma) else None,
+            **focal,
             "k1": camera.k1,
             "k2": camera.k2,
             "k3": camera.k3,
-            "found": "given" if self.config.camera.intrinsics else "from the video",
         }
         if isinstance(lens, OpenCvLens):
             facts["distortion"] = list(lens.distortion)
@@ -301,6 +314,15 @@ class RunJob:
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
+
+    def _focal(self) -> dict[str, Any]:
+        """Where the focal length comes from, and its relative 1-sigma; None where it is given."""
+        if self.config.camera.intrinsics:
+            return {"found": "given", "focal_sigma_ratio": None}
+        known = focal_knowledge(self.graph)
+        assumed = known is None or known.assumed
+        sigma_ratio = PRIOR_FOCAL_SIGMA if known is None else known.sigma_ratio
+        return {"found": "assumed" if assumed else "from the video", "focal_sigma_ratio": sigma_ratio}
 
     # -- what stops it ---------------------------------------------------------------------------------------
 
@@ -322,7 +344,7 @@ class RunJob:
         self.folder.make_room()
         try:
             graph = self.graph
-            if not self._final and graph.records:
+            if not self._final and graph.started:
                 if graph.initialised:
                     graph.solve_all(5, 1.0)
                 self._final = final_frames(graph)

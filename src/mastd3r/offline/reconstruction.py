@@ -132,6 +132,14 @@ class Reconstruction:
         return tuple(self._run.record.get("choices", ()))
 
     @property
+    def observability(self) -> dict[str, Any]:
+        """What the image motion let be known: its ``kind`` (none, rotation, plane, parallax), and from what.
+
+        ``said`` is the line for people where something is missing, else None; empty for a run that was stopped before.
+        """
+        return dict(self._run.record.get("observability") or {})
+
+    @property
     def is_complete(self) -> bool:
         """False where the run was stopped; ``reason`` says why."""
         return self._run.record.get("status") == "complete"

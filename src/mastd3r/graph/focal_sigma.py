@@ -1,0 +1,60 @@
+"""How well the focal length is known: the solver's sigma, made honest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.reprojection_kernels import edge_residuals
+from ..geometry.se3 import inverse
+from .intrinsics import PRIOR_FOCAL_SIGMA
+from .keyframe_graph import KeyframeGraph
+
+Array = NDArray[Any]
+CORRELATION = 90.0  # errors of matches are alike within a view and between views; docs/joint_optimisation.md
+ASSUMED = 0.5  # of the prior's sigma: where more is left, the data have hardly spoken
+
+
+@dataclass(frozen=True)
+class FocalKnowledge:
+    """1 sigma of log f, and whether that is the usual guess rather than what the video says."""
+
+    sigma_ratio: float
+    assumed: bool
+
+
+def focal_knowledge(graph: KeyframeGraph) -> FocalKnowledge | None:
+    """After ``solve_all``; None where the focal length is given, or nothing was solved yet.
+
+    The solver's information on log f, under unit pixel noise and without the prior's part of it, is divided by the
+    variance of the weighted residuals and by ``CORRELATION`` squared; then the prior's own is added.
+    """
+    report, intrinsics = graph.last_report, graph.intrinsics
+    if report is None or not intrinsics.free[0]:
+        return None
+    found = 0.0
+    if np.isfinite(report.focal_sigma_ratio):
+        unit = max(report.focal_sigma_ratio**-2 - float(intrinsics.prior_info[0]), 0.0)
+        found = unit / (CORRELATION * max(residual_sigma_px(graph, graph.config.kernel_px), 1e-6)) ** 2
+    sigma = float((found + PRIOR_FOCAL_SIGMA**-2) ** -0.5)
+    return FocalKnowledge(sigma, sigma > ASSUMED * PRIOR_FOCAL_SIGMA)
+
+
+def residual_sigma_px(graph: KeyframeGraph, kernel_px: float) -> float:
+    """1 sigma of a coordinate of the residuals as the robust solver weighs them: sqrt(Σ u² |r|² / 2 Σ u).
+
+    With u the weight that each match has in the normal equations, this times the solver's sigma is that of errors
+    which are independent, whatever their distribution.
+    """
+    squares = weights = 0.0
+    for e in graph.edges:
+        v = graph.variables[e.i]
+        j_from_i = graph.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
+        residual, _ = edge_residuals(v.px, v.inv_depth, e.target, j_from_i, graph.intrinsics.values)
+        r2 = (residual**2).sum(1)
+        u = e.weight / (1 + r2 / kernel_px**2)
+        squares, weights = squares + float((u**2 * r2).sum()), weights + float(u.sum())
+    return float(np.sqrt(squares / max(2 * weights, 1e-12)))
