@@ -227,7 +227,7 @@ def test_an_unreadable_frame_before_there_is_any_depth(mastd3r: Command, room_cl
     (folder / "003.png").write_bytes(b"")
     said = mastd3r(folder)
     incomplete(said, "003.png")
-    assert len(said.poses()) == 3
+    assert not [name for name in ("trajectory.txt", "camera.json") if (said.folder / name).exists()]  # none is known
 
 
 def test_frames_of_different_sizes(mastd3r: Command, room_clip: Path, tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ def test_a_camera_that_never_moves(mastd3r: Command, room_clip: Path, tmp_path: 
         shutil.copy(folder / "000.png", folder / f"{k:03d}.png")
     said = mastd3r(folder)
     incomplete(said, "the camera never moves enough", "20 frames")
-    assert len(said.poses()) == 20
+    assert not [name for name in ("trajectory.txt", "camera.json") if (said.folder / name).exists()]
 
 
 def test_noise_without_a_scene(mastd3r: Command, tmp_path: Path) -> None:

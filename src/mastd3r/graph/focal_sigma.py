@@ -14,7 +14,8 @@ from .intrinsics import PRIOR_FOCAL_SIGMA
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
-CORRELATION = 90.0  # errors of matches are alike within a view and between views; docs/joint_optimisation.md
+CORRELATION = 20.0  # errors of matches are alike within a view, so that they say less than as many independent ones
+SYSTEMATIC = 0.025  # 1 sigma of what no number of matches takes away, from sequences with truth
 ASSUMED = 0.5  # of the prior's sigma: where more is left, the data have hardly spoken
 
 
@@ -30,7 +31,8 @@ def focal_knowledge(graph: KeyframeGraph) -> FocalKnowledge | None:
     """After ``solve_all``; None where the focal length is given, or nothing was solved yet.
 
     The solver's information on log f, under unit pixel noise and without the prior's part of it, is divided by the
-    variance of the weighted residuals and by ``CORRELATION`` squared; then the prior's own is added.
+    variance of the weighted residuals and by ``CORRELATION`` squared; ``SYSTEMATIC`` is added to the sigma that is
+    left, then the prior's own information. docs/joint_optimisation.md says how the two constants were found.
     """
     report, intrinsics = graph.last_report, graph.intrinsics
     if report is None or not intrinsics.free[0]:
@@ -38,7 +40,8 @@ def focal_knowledge(graph: KeyframeGraph) -> FocalKnowledge | None:
     found = 0.0
     if np.isfinite(report.focal_sigma_ratio):
         unit = max(report.focal_sigma_ratio**-2 - float(intrinsics.prior_info[0]), 0.0)
-        found = unit / (CORRELATION * max(residual_sigma_px(graph, graph.config.kernel_px), 1e-6)) ** 2
+        noise = CORRELATION * max(residual_sigma_px(graph, graph.config.kernel_px), 1e-6)
+        found = 1 / (noise**2 / max(unit, 1e-12) + SYSTEMATIC**2)
     sigma = float((found + PRIOR_FOCAL_SIGMA**-2) ** -0.5)
     return FocalKnowledge(sigma, sigma > ASSUMED * PRIOR_FOCAL_SIGMA)
 

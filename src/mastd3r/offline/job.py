@@ -27,6 +27,7 @@ from ..export.run_folder import RunFolder
 from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.focal_sigma import focal_knowledge
+from ..graph.initialisation import bootstrap
 from ..graph.intrinsics import PRIOR_FOCAL_SIGMA
 from ..graph.keyframe_graph import KeyframeGraph
 from ..mapping.process import Outcome
@@ -344,7 +345,8 @@ class RunJob:
         self.folder.make_room()
         try:
             graph = self.graph
-            if not self._final and graph.started:
+            started = self._final or graph.started or (len(graph.members()) > 1 and bootstrap(graph))
+            if not self._final and started:  # before that there is neither place nor lens
                 if graph.initialised:
                     graph.solve_all(5, 1.0)
                 self._final = final_frames(graph)
