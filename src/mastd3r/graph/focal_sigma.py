@@ -15,7 +15,7 @@ from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
 CORRELATION = 20.0  # errors of matches are alike within a view, so that they say less than as many independent ones
-SYSTEMATIC = 0.025  # 1 sigma of what no number of matches takes away, from sequences with truth
+SYSTEMATIC = 0.027  # 1 sigma of what no number of matches takes away, from sequences with truth
 ASSUMED = 0.5  # of the prior's sigma: where more is left, the data have hardly spoken
 
 
