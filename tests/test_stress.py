@@ -181,18 +181,19 @@ def test_the_table_says_what_the_entries_hold(tmp_path: Path) -> None:
         "1.00",
         "2.10",
         "none",
-        "2 of 4",
+        "1 of 3",
         "1 of 3",
         "0",
         "1",
         "1.0",
         "2 of 3",
     ]
-    assert cells(lines, "street ")[:7] == ["4", "0.01", "0.51", "none", "2 of 4", "0 of 3", "1"]
+    assert cells(lines, "street ")[:7] == ["4", "0.01", "0.51", "none", "1 of 3", "0 of 3", "1"]
     assert cells(lines, "street ")[9] == "2 of 2"
     assert cells(lines, "blur")[:6] == ["2", "–", "2.00", "2.00", "2 of 2", "0 of 2"]
+    assert cells(lines, "base |")[4] == "–"  # nothing is held against itself
     assert cells(lines, "noise")[4:6] == ["0 of 2", "1 of 2"]
-    assert cells(lines, "all |") == cells(lines, "all |", 1) and cells(lines, "all |")[4] == "4 of 8"
+    assert cells(lines, "all |") == cells(lines, "all |", 1) and cells(lines, "all |")[4] == "2 of 6"
     at = dict(zip(stress_table.SHARES, cells(lines, "all, 8 runs"), strict=True))
     assert at[0.001] == "12%" and at[0.005] == "25%" and at[0.1] == "75%"
     assert cells(lines, "three changes, 2 runs")[-1] == "0%" and cells(lines, "base, 2 runs")[3] == "100%"
