@@ -258,12 +258,36 @@ def test_bad_lists(tmp_path: Path, name: str, text: str, message: str) -> None:
         open_source(folder, ALL, want_depth=True)
 
 
-@pytest.mark.parametrize("row", ["1 0 0 0 0 0 0 0", "1 nan 0 0 0 0 0 1", "1 0 0 0 0 0 0", "1 0 0 x 0 0 0 1"])
-def test_bad_poses(tmp_path: Path, row: str) -> None:
+@pytest.mark.parametrize(
+    "row",
+    [
+        "1 0 0 0 0 0 0 0",
+        "1 nan 0 0 0 0 0 1",
+        "1 0 0 0 0 0 0",
+        "1 0 0 x 0 0 0 1",
+        "1 1e200 0 0 0 0 0 1",
+        "0 5 0 0 0 0 0 1",
+    ],
+)
+def test_rows_of_truth_that_are_no_poses_are_left_out(tmp_path: Path, row: str) -> None:
     folder, _ = tum_folder(tmp_path / "seq")
-    (folder / "groundtruth.txt").write_text(f"0 0 0 0 0 0 0 1\n{row}\n")
-    with pytest.raises(InputError, match=r"groundtruth\.txt line 2: expected"):
-        open_source(folder, ALL).truth()
+    (folder / "groundtruth.txt").write_bytes(f"\ufeff0,0,0,0,0,0,0,1\r\n{row}\r\n2 7 0 0 0 0 0 1\r\n".encode())
+    source = open_source(folder, ALL)
+    truth = source.truth()
+    assert truth is not None and truth.timestamps_s.tolist() == [0.0, 2.0]
+    assert truth.world_from_cam[:, 0, 3].tolist() == [0.0, 7.0]
+    said = [n for n in source.notes if n.startswith("truth:")]
+    assert len(said) == 1 and "1 rows" in said[0] and "groundtruth.txt line 2" in said[0]
+
+
+@pytest.mark.parametrize("content", [b"", b"# nothing\n", b"\xff\xfe\x00"])
+def test_truth_without_a_pose_is_none(tmp_path: Path, content: bytes) -> None:
+    folder, _ = tum_folder(tmp_path / "seq")
+    (folder / "groundtruth.txt").write_bytes(content)
+    source = open_source(folder, ALL)
+    truth = source.truth()
+    assert truth is None or len(truth.timestamps_s) == 0
+    assert any("truth" in n for n in source.notes) == (content[:1] == b"\xff")
 
 
 def test_windows(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
@@ -26,6 +27,7 @@ from .sources import open_source
 from .types import Frame, Source
 
 Array = NDArray[Any]
+log = logging.getLogger(__name__)
 
 
 def load(path: str | Path) -> Reconstruction:
@@ -71,7 +73,10 @@ def evaluate_trajectory(path: str | Path, kind: str, sequence: str | Path) -> di
     """
     source = open_source(sequence, Config().source)
     times_s = np.array([f.timestamp_s for f in source.frames()])
-    return score(read_trajectory(Path(path), kind, times_s), source.truth(), times_s).metrics
+    found = score(read_trajectory(Path(path), kind, times_s), source.truth(), times_s).metrics
+    for note in source.notes:
+        log.warning(note)
+    return found
 
 
 @one_blas_thread()

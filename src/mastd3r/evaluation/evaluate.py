@@ -86,14 +86,37 @@ def evaluate(
 def evaluate_trajectory(trajectory: Trajectory, truth: Truth | None, timestamps_s: Array) -> Evaluation:
     """Score poses alone, such as another system's, against a sequence whose frames have the times (n,).
 
-    The same figures by the same code as those of ``evaluate``. Raises InputError where truth has no poses.
+    The same figures by the same code as those of ``evaluate``, over the poses that are finite; the others are counted.
+    Raises InputError where truth has no poses, and where no pose has the time of a frame.
     """
     if truth is None or not len(truth.timestamps_s):
         raise InputError("expected a sequence with true poses, got one without")
-    finite = np.isfinite(trajectory.world_from_cam).all((1, 2))
-    posed, _ = associate(timestamps_s, trajectory.timestamps_s[finite], SAME_TIME_S)
+    finite = np.isfinite(trajectory.world_from_cam).all((1, 2)) & np.isfinite(trajectory.timestamps_s)
+    found = Trajectory(
+        trajectory.timestamps_s[finite],
+        trajectory.world_from_cam[finite],
+        tuple(s for s, f in zip(trajectory.states, finite, strict=True) if f),
+        trajectory.is_keyframe[finite],
+    )
+    posed, _ = associate(timestamps_s, found.timestamps_s, SAME_TIME_S)
+    if not len(posed):
+        raise InputError(_why_no_time(timestamps_s, found.timestamps_s))
     metrics: dict[str, Any] = {"frames": len(timestamps_s), "frames_posed": len(posed)}
-    return Evaluation(metrics, _add_trajectory_error(metrics, trajectory, truth), ())
+    if not finite.all():
+        metrics["poses_not_finite"] = int((~finite).sum())
+    return Evaluation(metrics, _add_trajectory_error(metrics, found, truth), ())
+
+
+def _why_no_time(frames_s: Array, poses_s: Array) -> str:
+    """What to say of poses none of which is at a frame's time."""
+    wanted = f"expected poses at the times of the frames, {frames_s.min():.6f} to {frames_s.max():.6f} s"
+    if not len(poses_s):
+        return f"{wanted}, got none that are finite"
+    got = f"{wanted}, got {poses_s.min():.6f} to {poses_s.max():.6f}"
+    for name, unit in (("nanoseconds", 1e9), ("microseconds", 1e6), ("milliseconds", 1e3)):
+        if len(associate(frames_s, poses_s / unit, 10 * SAME_TIME_S)[0]):
+            return f"{got}: these look like {name}"
+    return got
 
 
 def read_positions(path: Path) -> tuple[Array, Array]:

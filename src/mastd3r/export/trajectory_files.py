@@ -38,7 +38,7 @@ def read_tum(path: Path, state: State = "tracked") -> Trajectory:
     """
     rows: list[list[float]] = []
     for number, line in _lines(path):
-        row = _floats(path, number, line, line.split())
+        row = _floats(path, number, line, line.replace(",", " ").split())
         if len(row) != 8 or not any(row[4:]):
             raise InputError(f"{path} line {number}: expected t tx ty tz qx qy qz qw, got {line[:60]!r}")
         rows.append(row)
@@ -94,7 +94,7 @@ def _read_euroc(path: Path) -> Trajectory:
 def _lines(path: Path) -> list[tuple[int, str]]:
     """(number from 1, text) of every line that is neither empty nor a comment."""
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as e:
         raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
     return [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]

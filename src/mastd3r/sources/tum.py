@@ -25,6 +25,8 @@ from .semantic_maps import match_maps, nearest_time
 from .sequence import calibration_for
 
 Array = NDArray[Any]
+POSE_ROW = "timestamp_s tx ty tz qx qy qz qw"
+FARTHEST = 1e9  # metres; beyond, a number is no position
 TUM_DEPTH_SCALE = 5000.0  # units of a 16-bit depth file a metre, where info.json does not tell
 
 
@@ -125,7 +127,7 @@ class TumSource:
         return Truth(times, poses, moving, focal)
 
     def _poses(self) -> tuple[Array, Array]:
-        return _read_poses(self._folder / "groundtruth.txt")
+        return _read_poses(self._folder / "groundtruth.txt", self._notes)
 
     def _image(self, i: int) -> Path:
         return self._folder / self._rows[i].words[0]
@@ -191,8 +193,11 @@ def _read_info(path: Path) -> dict[str, Any]:
     return data
 
 
-def _rows_of(path: Path, words: int, what: str) -> list[Row]:
-    """Lines of a TUM list: a time, then ``words`` words (1: the rest of the line). Raises InputError."""
+def _rows_of(path: Path, words: int, what: str, left_out: list[int] | None = None) -> list[Row]:
+    """Lines of a TUM list: a time, then ``words`` words (1: the rest of the line).
+
+    Raises InputError for a line that is something else; with ``left_out``, its number is put there instead.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as e:
@@ -206,10 +211,13 @@ def _rows_of(path: Path, words: int, what: str) -> list[Row]:
             time_s = float(parts[0])
         except ValueError:
             time_s = np.nan
-        if len(parts) < words + 1 or not np.isfinite(time_s):
+        if len(parts) >= words + 1 and np.isfinite(time_s):
+            rows.append(Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
+        elif left_out is None:
             raise InputError(f"{path} line {number}: expected '{what}', got {line.strip()!r}")
-        rows.append(Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
-    if not rows:
+        else:
+            left_out.append(number)
+    if not rows and left_out is None:
         raise InputError(f"{path}: expected lines of '{what}', got none")
     return rows
 
@@ -228,21 +236,37 @@ def _check_ascending(rows: list[Row], path: Path) -> None:
             )
 
 
-def _read_poses(path: Path) -> tuple[Array, Array]:
-    """groundtruth.txt as (n,) float64 ascending seconds and (n, 4, 4) float64 world_from_cam; n may be 0."""
+def _read_poses(path: Path, notes: Notes) -> tuple[Array, Array]:
+    """groundtruth.txt as (n,) float64 ascending seconds and (n, 4, 4) float64 world_from_cam; n may be 0.
+
+    Truth never stops a run: a row that is no pose, or repeats a time, is left out with a note.
+    """
     if not path.is_file():
         return np.empty(0), np.empty((0, 4, 4))
-    layout = "timestamp_s tx ty tz qx qy qz qw"
-    rows = sorted(_rows_of(path, 7, layout), key=lambda r: r.timestamp_s)
-    values = np.empty((len(rows), 7))
-    for k, row in enumerate(rows):
+    left_out: list[int] = []
+    try:
+        rows = _rows_of(path, 7, POSE_ROW, left_out)
+    except InputError as e:
+        notes.put("truth", f"truth is left out: {e}")
+        return np.empty(0), np.empty((0, 4, 4))
+    found: dict[float, list[float]] = {}
+    for row in rows:
         try:
-            values[k] = [float(w) for w in row.words]
+            values = [float(w) for w in row.words]
         except ValueError:
-            values[k] = np.nan
-        if not np.isfinite(values[k]).all() or np.linalg.norm(values[k, 3:]) < 1e-6:
-            raise InputError(f"{path} line {row.line}: expected '{layout}', got {' '.join(row.words)!r}")
-    world_from_cam = np.tile(np.eye(4), (len(rows), 1, 1))
-    world_from_cam[:, :3, 3] = values[:, :3]
-    world_from_cam[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
-    return np.array([r.timestamp_s for r in rows]), world_from_cam
+            values = [np.nan]
+        sound = np.isfinite(values).all() and max(map(abs, values)) < FARTHEST and np.linalg.norm(values[3:]) > 1e-6
+        if sound and row.timestamp_s not in found:
+            found[row.timestamp_s] = values
+        else:
+            left_out.append(row.line)
+    if left_out:
+        first = f"{path.name} line {min(left_out)}"
+        notes.put("truth", f"truth: {len(left_out)} rows are no poses ({POSE_ROW}), or repeat a time, from {first} on")
+    times = np.array(sorted(found))
+    poses = np.array([found[t] for t in times]).reshape(-1, 7)
+    world_from_cam = np.tile(np.eye(4), (len(times), 1, 1))
+    world_from_cam[:, :3, 3] = poses[:, :3]
+    if len(times):
+        world_from_cam[:, :3, :3] = Rotation.from_quat(poses[:, 3:]).as_matrix()
+    return times, world_from_cam
