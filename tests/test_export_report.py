@@ -239,6 +239,9 @@ def test_figures_read_well() -> None:
     assert shown("mask_iou", None) == "–"
     assert described("ate_rmse_all_note").startswith("Why no ATE")
     assert summary_line({"frames": 3, "frames_posed": 2, "fps_total": 1.5}) == "2 of 3 frames posed · 1.50 frames/s"
+    counted = {"frames": 9, "frames_posed": 8, "frames_tracked": 5, "frames_interpolated": 3, "frames_lost": 1}
+    assert summary_line(counted) == "5 of 9 frames tracked (3 interpolated, 1 lost)"
+    assert summary_line({**counted, "frames_interpolated": 0, "frames_lost": 0}) == "5 of 9 frames tracked"
     given = {"odd": 1, "gaussians": 2, "ate_rmse_all": None, "ate_rmse_all_note": "still", "frames": 3}
     assert [k for k, _ in in_order(given)] == [
         "frames",

@@ -62,7 +62,7 @@ def test_a_whole_run_comes_back(tmp_path: Path) -> None:
     assert np.array_equal(run.render(0.2), np.full((4, 6, 3), [255, 128, 0]))
     assert (run.mask_times_s().tolist(), run.render_times_s().tolist()) == ([0.1], [0.2])
     assert {p.name for p in folder.path.iterdir()} == {
-        "run.json", "config.yaml", "trajectory.txt", "keyframes.txt", "camera.json", "metrics.json",
+        "run.json", "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "metrics.json",
         "masks", "renders", "alpha", "depth",
     }  # fmt: skip
 

@@ -9,6 +9,10 @@ from typing import Any
 NAMES: dict[str, tuple[str, str, str]] = {
     "frames": ("Frames read", "d", ""),
     "frames_posed": ("Frames with a pose", "d", ""),
+    "frames_tracked": ("Frames tracked", "d", ""),
+    "frames_interpolated": ("Frames whose pose is interpolated", "d", ""),
+    "frames_lost": ("Frames without a pose", "d", ""),
+    "poses_not_finite": ("Rows of the trajectory that are no pose", "d", ""),
     "keyframes": ("Keyframes", "d", ""),
     "ate_rmse_all": ("ATE, all frames (RMSE after Sim(3))", ".4f", "m"),
     "ate_rmse_keyframes": ("ATE, keyframes", ".4f", "m"),
@@ -72,7 +76,12 @@ def summary_line(metrics: Mapping[str, Any]) -> str:
     """The run in one line."""
     parts = []
     if metrics.get("frames"):
-        parts.append(f"{metrics.get('frames_posed', 0)} of {metrics['frames']} frames posed")
+        if "frames_tracked" not in metrics:
+            parts.append(f"{metrics.get('frames_posed', 0)} of {metrics['frames']} frames posed")
+        else:
+            others = [f"{metrics[f'frames_{s}']} {s}" for s in ("interpolated", "lost") if metrics[f"frames_{s}"]]
+            rest = f" ({', '.join(others)})" if others else ""
+            parts.append(f"{metrics['frames_tracked']} of {metrics['frames']} frames tracked{rest}")
     short = {"ate_rmse_all": "ATE", "psnr_holdout": "PSNR", "mask_iou": "mask IoU"}
     short |= {"fps_total": "", "peak_rss_mib": ""}
     for key, name in short.items():

@@ -90,11 +90,13 @@ class RunFolder:
         write_text(self.path / "config.yaml", yaml_text)
 
     def write_trajectory(self, trajectory: Trajectory) -> None:
-        """trajectory.txt and keyframes.txt; how frames came by their poses goes to run.json."""
+        """trajectory.txt, keyframes.txt and states.txt: how frames came by their poses, which goes to run.json too."""
         write_tum(self.path / "trajectory.txt", trajectory)
         write_tum(self.path / "keyframes.txt", trajectory.keyframes())
         pairs = zip(trajectory.states, trajectory.world_from_cam, strict=True)
         states = [state for state, pose in pairs if np.isfinite(pose).all()]
+        rows = (f"{t:.6f} {s}\n" for t, s in zip(trajectory.timestamps_s, trajectory.states, strict=True))
+        write_text(self.path / "states.txt", "# timestamp state\n" + "".join(rows))
         self.update(states=_run_lengths(states))
 
     def write_camera(self, camera: Camera, distortion: Sequence[float] | None = None, **known: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -219,9 +220,11 @@ class RunJob:
         """Figures against the truth, where there is one, and the report."""
         elapsed = time.perf_counter() - self._began
         evaluation = evaluate(self.folder.path, self.source.truth(), self.source.frames())
+        states = Counter("tracked" if f.state == "started" else f.state for f in self._final)
         self.metrics = {
             **evaluation.metrics,
             **self.metrics,
+            **{f"frames_{s}": states[s] for s in ("tracked", "interpolated", "lost")},
             "keyframes": len(self.graph.keyframes),
             "focal_px": _focal_px(self.tracked.lens()),
             "fps_tracking": self.frames / self.timings["tracking"],
@@ -234,6 +237,7 @@ class RunJob:
             self.folder.update(accelerator=card[0])
             self.metrics["peak_gpu_mib"] = card[1]
         self.folder.write_metrics(self.metrics)
+        self.folder.note(*self.source.notes)  # what the truth had to say too
         if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
             self.folder.write_aligned(aligned)
         self.folder.update(timings_s=self.timings)
@@ -315,6 +319,10 @@ class RunJob:
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
+        if 2 * sum(f.state in ("tracked", "started") for f in self._final) < len(self._final):
+            few = f"fewer than half of the {len(self._final)} frames were tracked: most of the trajectory is a guess"
+            self.folder.note(few)
+            log.warning(few)
 
     def _focal(self) -> dict[str, Any]:
         """Where the focal length comes from, and its relative 1-sigma; None where it is given."""
@@ -323,7 +331,8 @@ class RunJob:
         known = focal_knowledge(self.graph)
         assumed = known is None or known.assumed
         sigma_ratio = PRIOR_FOCAL_SIGMA if known is None else known.sigma_ratio
-        return {"found": "assumed" if assumed else "from the video", "focal_sigma_ratio": sigma_ratio}
+        start = "EXIF" if self.graph.intrinsics.focal_source == "EXIF" else "assumed"
+        return {"found": start if assumed else "from the video", "focal_sigma_ratio": sigma_ratio}
 
     # -- what stops it ---------------------------------------------------------------------------------------
 
