@@ -143,12 +143,18 @@ def test_pairs_that_see_the_same_are_matched_once(scene: Any) -> None:
 class Recognises:
     """Both parts of the front end: says which keyframes look alike, and what one sees of the other, exactly."""
 
-    def __init__(self, scene: Any, graph: KeyframeGraph, alike: tuple[int, int], **spoilt: float) -> None:
-        self.scene, self.graph, self.alike, self.spoilt = scene, graph, alike, spoilt
+    def __init__(self, scene: Any, graph: KeyframeGraph, pair: tuple[int, int], **spoilt: float) -> None:
+        self.scene, self.graph, self.pair, self.spoilt = scene, graph, pair, spoilt
         self.compared: list[tuple[int, int]] = []
+        self.parts = self.features = self  # of its own
+        self.shares: dict[tuple[int, int], float] = {}  # (i, j): what j's features have in common with those of i
+
+    def alike(self, image: Array, others: list[Array]) -> Array:
+        at = {id(kf.work.gray): kf.id for kf in self.graph.keyframes}
+        return np.array([self.shares.get((at[id(o)], at[id(image)]), 0.0) for o in others])
 
     def best(self, graph: KeyframeGraph, seen: Any, among: list[int], count: int, least: float) -> list[Any]:
-        i, j = self.alike
+        i, j = self.pair
         return [graph.keyframes[i]] if seen.index == j and i in among else []
 
     def relocalised(self, kf: Any, work: Any, prior: Array) -> TwoView | None:
@@ -179,6 +185,24 @@ def test_a_loop_is_seen_both_ways_and_closed(scene: Any) -> None:
     assert (loop.i, loop.j) == (2, 9) and loop.j_from_i.scale == pytest.approx(DRIFT, rel=0.02)
     assert front.compared == [(2, 9), (9, 2)] and graph.connected(2, 9)
     assert off(graph, centres) < 0.02
+
+
+@pytest.mark.parametrize(("share", "found"), [(0.3, True), (0.05, False)])
+def test_a_loop_is_found_by_what_two_views_share(scene: Any, share: float, found: bool) -> None:
+    """Small pictures of the places do not look alike, but their features do."""
+    graph, _ = drifted(scene)
+    front = Recognises(scene, graph, (-1, -1))
+    front.shares = {(1, 10): share, (0, 10): share / 2, (1, 9): 1.0}  # the last is no older than a neighbour may be
+    loops = close_loops(front, graph, front)  # type: ignore[arg-type]
+    assert [(x.i, x.j) for x in loops] == ([(1, 10)] if found else [])
+
+
+@pytest.mark.parametrize(("turn", "believed"), [(0.3, True), (0.75, False)])
+def test_two_places_that_look_alike_do_not_turn_the_map(scene: Any, turn: float, believed: bool) -> None:
+    """More than so much of a turn no tracking loses: then it is another place, however well the two agree."""
+    graph, _ = drifted(scene, scale=1.0, turn=np.array([0, 0, 0, 0, turn, 0.0]))
+    front = Recognises(scene, graph, (2, 9))
+    assert bool(close_loops(front, graph, front)) == believed  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

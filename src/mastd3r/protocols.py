@@ -68,6 +68,10 @@ class FeatureMatcher(Protocol):
         """
         ...
 
+    def alike(self, image: Array, others: Sequence[Array]) -> Array:
+        """(n,) 0..1, how much each of n images looks like this one, for loops; 0 where the part has no opinion."""
+        ...
+
 
 class Aligner(Protocol):
     """III-B: the pose of a new view against its anchor, in three stages. Built with (config.alignment)."""

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..concurrency import one_torch_thread
 from ..types import FeatureMatches
 from .verification import is_static, of_one_geometry
 
 Array = NDArray[Any]
 MOST_FEATURES = 768  # of an image; those found best
 MIN_MATCHES = 25  # that agree on one geometry
+FEATURES_OF_A_PLACE, SAME_FEATURE = 200, 0.85  # that are compared, and the cosine above which two are the same
 KEPT_IMAGES, KEPT_PAIRS = 256, 256  # that are remembered: a pair is asked both ways, and again as keyframes
 
 
@@ -51,13 +53,24 @@ class LearnedFeatures:
         self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None
     ) -> FeatureMatches | None:
         """See ``protocols.FeatureMatcher``."""
-        with self._one_at_a_time:
+        with self._one_at_a_time, one_torch_thread():
             px_ref, px_new = self._described(ref)[0], self._described(new)[0]
             rows_ref, rows_new, score = self._matched(ref, new)
         a, b = px_ref[rows_ref].astype(float), px_new[rows_new].astype(float)
         static = is_static(a, ref_moving) & is_static(b, new_moving)
         agree = np.flatnonzero(static)[of_one_geometry(a[static], b[static])]
         return FeatureMatches(a[agree], b[agree], score[agree]) if len(agree) >= MIN_MATCHES else None
+
+    def alike(self, image: Array, others: Sequence[Array]) -> Array:
+        """(n,) share of the best features of an image that each of the others has too; 0 where nobody asked before.
+
+        A run whose flow was good everywhere does not read the networks for this.
+        """
+        if self._networks is None:
+            return np.zeros(len(others))
+        with self._one_at_a_time, one_torch_thread():
+            described = [self._described(a)[1][:FEATURES_OF_A_PLACE] for a in (image, *others)]
+        return np.array([_common(described[0], d) for d in described[1:]])
 
     def _networks_loaded(self) -> tuple[FeatureNetwork, MatchNetwork]:
         if self._networks is None:
@@ -87,3 +100,13 @@ class LearnedFeatures:
             if len(self._pairs) > KEPT_PAIRS:
                 self._pairs.popitem(last=False)
         return self._pairs[here][1]
+
+
+def _common(a: Array, b: Array) -> float:
+    """Share of descriptors that are one another's nearest, and near."""
+    if min(len(a), len(b)) == 0:
+        return 0.0
+    cosine = a @ b.T
+    there, back = cosine.argmax(1), cosine.argmax(0)
+    mutual = (back[there] == np.arange(len(a))) & (cosine[np.arange(len(a)), there] > SAME_FEATURE)
+    return float(mutual.mean())

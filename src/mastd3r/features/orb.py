@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -56,6 +57,10 @@ class OrbFeatures:
             return None
         agree = inlier.ravel() > 0
         return FeatureMatches(a[agree].astype(float), b[agree].astype(float), np.ones(int(agree.sum())))
+
+    def alike(self, image: Array, others: Sequence[Array]) -> Array:
+        """Zeros: too many places share some corners."""
+        return np.zeros(len(others))
 
 
 def build() -> OrbFeatures:

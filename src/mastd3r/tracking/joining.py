@@ -9,6 +9,7 @@ from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.submaps import join, with_scale
 from .covisibility import CovisibilityEdges
+from .places import most_alike
 from .two_view import TwoViewEstimator
 
 log = logging.getLogger(__name__)
@@ -25,7 +26,10 @@ def join_recognised(
     """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
     own = graph.submap_of[kf.id]
     others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
-    for other in places.best(graph, kf.work, others):
+    candidates = places.best(graph, kf.work, others)
+    known = {c.id for c in candidates}
+    candidates += [k for k in most_alike(two_view.parts, graph, kf.work, others) if k.id not in known]
+    for other in candidates:
         view = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
         if view is None:
             continue

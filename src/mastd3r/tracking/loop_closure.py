@@ -14,11 +14,12 @@ from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
 from ..graph.covisibility import overlaps
-from ..graph.keyframe_graph import KeyframeGraph
+from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
 from ..types import USABLE_WEIGHT
+from .places import most_alike
 from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
@@ -28,6 +29,9 @@ APART = 3  # keyframes between two of one place, below: they are neighbours
 MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
 SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
+MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
+SEEN_TOGETHER = 0.5  # rad between two views that may see the same
+LONG_BEFORE = 8  # keyframes; those nearer are matched as neighbours
 COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
 COVISIBLE_PAIRS = 4  # of those for each keyframe, at most
 
@@ -42,7 +46,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     for j in ids:
         kf = graph.keyframes[j]
         far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
-        for other in places.best(graph, kf.work, far, 2, MIN_SIMILARITY):
+        for other in [*places.best(graph, kf.work, far, 2, MIN_SIMILARITY), *_alike(two_view, graph, j, far)]:
             there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
             back = two_view.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
             loop = _loop(graph, other.id, j, there, back)
@@ -57,6 +61,14 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
         optimise_pose_graph(graph, found)
         graph.solve_all(10, 2.0)
     return found
+
+
+def _alike(two_view: TwoViewEstimator, graph: KeyframeGraph, j: int, far: list[int]) -> list[Keyframe]:
+    """The keyframe that shares most features with j, long before it, where the tracked poses let both see one thing."""
+    view = graph.variables[j].cam_from_world[:3, :3]
+    turns = {i: np.linalg.norm(so3_log(view @ graph.variables[i].cam_from_world[:3, :3].T)) for i in far}
+    ids = [i for i in far if i < j - LONG_BEFORE and turns[i] < MAX_DRIFT + SEEN_TOGETHER]
+    return most_alike(two_view.parts, graph, graph.keyframes[j].work, ids)
 
 
 def _known(found: list[Loop], i: int, j: int) -> bool:
@@ -81,6 +93,11 @@ def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: Two
     better = there if there.alignment.inlier_ratio >= back.alignment.inlier_ratio else back
     turn = np.linalg.norm(so3_log(i_from_j.rotation @ j_from_i.rotation))
     if better.alignment.inlier_ratio < SURE_INLIERS or turn > MAX_TURN:
+        return None
+    tracked = graph.variables[j].cam_from_world[:3, :3] @ graph.variables[i].cam_from_world[:3, :3].T
+    drift = float(np.linalg.norm(so3_log(j_from_i.rotation @ tracked.T)))
+    if drift > MAX_DRIFT:
+        log.info("keyframes %d and %d look alike, but %.0f deg of drift speak against it", i, j, np.degrees(drift))
         return None
     scale = float(np.sqrt(j_from_i.scale / i_from_j.scale))
     if better is back:
