@@ -151,7 +151,7 @@ class Recognises:
 
     def alike(self, image: Array, others: list[Array]) -> Array:
         at = {id(kf.work.gray): kf.id for kf in self.graph.keyframes}
-        return np.array([self.shares.get((at[id(o)], at[id(image)]), 0.0) for o in others])
+        return np.array([self.shares.get((at[id(o)], at[id(image)]), np.nan) for o in others])
 
     def best(self, graph: KeyframeGraph, seen: Any, among: list[int], count: int, least: float) -> list[Any]:
         i, j = self.pair
@@ -195,6 +195,13 @@ def test_a_loop_is_found_by_what_two_views_share(scene: Any, share: float, found
     front.shares = {(1, 10): share, (0, 10): share / 2, (1, 9): 1.0}  # the last is no older than a neighbour may be
     loops = close_loops(front, graph, front)  # type: ignore[arg-type]
     assert [(x.i, x.j) for x in loops] == ([(1, 10)] if found else [])
+
+
+def test_a_picture_that_shares_no_feature_is_not_looked_at(scene: Any) -> None:
+    graph, _ = drifted(scene)
+    front = Recognises(scene, graph, (2, 9))
+    front.shares = {(2, 9): 0.01}
+    assert close_loops(front, graph, front) == [] and front.compared == []  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("turn", "believed"), [(0.3, True), (0.75, False)])

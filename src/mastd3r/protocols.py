@@ -69,7 +69,7 @@ class FeatureMatcher(Protocol):
         ...
 
     def alike(self, image: Array, others: Sequence[Array]) -> Array:
-        """(n,) 0..1, how much each of n images looks like this one, for loops; 0 where the part has no opinion."""
+        """(n,) 0..1, how much each of n images looks like this one, for loops; NaN where the part has no opinion."""
         ...
 
 

@@ -62,12 +62,12 @@ class LearnedFeatures:
         return FeatureMatches(a[agree], b[agree], score[agree]) if len(agree) >= MIN_MATCHES else None
 
     def alike(self, image: Array, others: Sequence[Array]) -> Array:
-        """(n,) share of the best features of an image that each of the others has too; 0 where nobody asked before.
+        """(n,) share of the best features of an image that each of the others has too; NaN where nobody asked before.
 
         A run whose flow was good everywhere does not read the networks for this.
         """
         if self._networks is None:
-            return np.zeros(len(others))
+            return np.full(len(others), np.nan)
         with self._one_at_a_time, one_torch_thread():
             described = [self._described(a)[1][:FEATURES_OF_A_PLACE] for a in (image, *others)]
         return np.array([_common(described[0], d) for d in described[1:]])

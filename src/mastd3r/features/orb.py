@@ -59,8 +59,8 @@ class OrbFeatures:
         return FeatureMatches(a[agree].astype(float), b[agree].astype(float), np.ones(int(agree.sum())))
 
     def alike(self, image: Array, others: Sequence[Array]) -> Array:
-        """Zeros: too many places share some corners."""
-        return np.zeros(len(others))
+        """No opinion: too many places share some corners."""
+        return np.full(len(others), np.nan)
 
 
 def build() -> OrbFeatures:

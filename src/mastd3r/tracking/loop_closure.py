@@ -19,7 +19,7 @@ from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
 from ..types import USABLE_WEIGHT
-from .places import most_alike
+from .places import most_alike, not_unlike
 from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
@@ -46,7 +46,8 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     for j in ids:
         kf = graph.keyframes[j]
         far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
-        for other in [*places.best(graph, kf.work, far, 2, MIN_SIMILARITY), *_alike(two_view, graph, j, far)]:
+        small = not_unlike(two_view.parts, kf.work, places.best(graph, kf.work, far, 2, MIN_SIMILARITY))
+        for other in [*small, *_alike(two_view, graph, j, far)]:
             there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
             back = two_view.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
             loop = _loop(graph, other.id, j, there, back)

@@ -11,6 +11,7 @@ from ..parts import Parts
 from ..types import WorkFrame
 
 MOST_COMPARED = 200  # keyframes, spread over all that there are
+UNLIKE = 0.04
 MIN_ALIKE = 0.08  # share of features that two views have in common, to be looked at
 
 
@@ -26,5 +27,13 @@ def most_alike(
         return []
     ids = list(among)[:: 1 + len(among) // MOST_COMPARED]
     share = parts.features.alike(work.gray, [graph.keyframes[k].work.gray for k in ids])
-    first = np.argsort(-share, kind="stable")[:count]
+    first = np.argsort(-np.nan_to_num(share), kind="stable")[:count]
     return [graph.keyframes[ids[n]] for n in first if share[n] >= MIN_ALIKE]
+
+
+def not_unlike(parts: Parts, work: WorkFrame, candidates: Sequence[Keyframe]) -> list[Keyframe]:
+    """Without those that share next to no feature with a frame: to look at each closely costs a hundred times more."""
+    if not candidates:
+        return []
+    share = parts.features.alike(work.gray, [kf.work.gray for kf in candidates])
+    return [kf for kf, s in zip(candidates, share, strict=True) if not s < UNLIKE]

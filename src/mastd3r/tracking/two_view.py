@@ -23,6 +23,7 @@ from .observation import Observation
 from .state import TrackingState
 
 Array = NDArray[Any]
+Far = FeatureMatches | None
 THIN = 0.3  # share of a keyframe's static points that are matched, below: another start is tried
 
 
@@ -51,17 +52,10 @@ class TwoViewEstimator:
         return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor)
 
     def problem(
-        self,
-        ref: Keyframe,
-        new: WorkFrame,
-        prior: Future[Array],
-        flow: Array | None,
-        guess: Array,
-        near: bool = True,
-        far: FeatureMatches | None = None,
+        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, far: Far = None
     ) -> AlignmentProblem:
         """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
-        ``near``: within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
+        within the motion of one frame, or from the sparse features ``far``; ``guess`` (4, 4) new_from_ref."""
         graph, started = self.graph, self._started(ref)
         variables = graph.variables[ref.id]
         inv_depth, info = (variables.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
@@ -74,7 +68,7 @@ class TwoViewEstimator:
             return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
         pair, weight = matched(flow, far)
-        if near and matched_share(ref, weight) < THIN and (found := self._far(ref, new, prior)) is not None:
+        if far is None and matched_share(ref, weight) < THIN and (found := self._far(ref, new, prior)) is not None:
             pair, weight = max((pair, weight), matched(*found), key=lambda found: float(found[1].sum()))
         sigma = self.parts.provider.depth_sigma_ratio
         if not started:
@@ -93,17 +87,10 @@ class TwoViewEstimator:
         return TwoView(ref, problem.pair, problem.weight, alignment, *motion)
 
     def estimate(
-        self,
-        ref: Keyframe,
-        new: WorkFrame,
-        prior: Future[Array],
-        flow: Array | None,
-        guess: Array,
-        near: bool = True,
-        far: FeatureMatches | None = None,
+        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, far: Far = None
     ) -> TwoView:
         """``problem``, and its coarse, scale and fine stage in order."""
-        problem = self.problem(ref, new, prior, flow, guess, near, far)
+        problem = self.problem(ref, new, prior, flow, guess, far)
         view = self.view(ref, problem, align(self.parts.aligner, problem))
         assert view is not None
         return view
@@ -121,7 +108,7 @@ class TwoViewEstimator:
         start, features = self._far(kf, work, prior) or (None, None)
         if start is None and not self.parts.provider.finds_far:
             return None
-        view = self.estimate(kf, work, prior, start, np.eye(4), near=False, far=features)
+        view = self.estimate(kf, work, prior, start, np.eye(4), features)
         return view if self.accepted(view) else None
 
     def _started(self, ref: Keyframe) -> bool:
