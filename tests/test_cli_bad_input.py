@@ -210,23 +210,24 @@ def test_one_frame(mastd3r: Command, room_clip: Path, tmp_path: Path) -> None:
     incomplete(said, "expected at least 2 frames, got 1")
 
 
-def test_an_unreadable_frame_in_the_middle(mastd3r: Command, room_clip: Path, tmp_path: Path) -> None:
+def test_an_unreadable_frame_in_the_middle_is_left_out_and_named(
+    mastd3r: Command, room_clip: Path, tmp_path: Path
+) -> None:
     folder = images_of(room_clip, tmp_path / "shots", 24)
     (folder / "019.png").write_bytes(b"\x89PNG no more than a beginning")
     said = mastd3r(folder)
-    incomplete(said, "019.png", "expected a readable image")
+    assert said.code == 0 and said.record["status"] == "complete"
+    assert any("019.png" in note and "left out" in note for note in said.record["choices"])
     poses = said.poses()
-    assert len(poses) == 19 and np.isfinite(poses).all()
-    np.testing.assert_allclose(poses[:, 0], np.arange(19) / 30, atol=1e-6)
+    assert len(poses) == 23 and np.isfinite(poses).all()
     assert np.ptp(poses[:, 1:4], 0).max() > 0  # and they are poses, not the first one again and again
-    assert (said.folder / "camera.json").is_file() and not (said.folder / "metrics.json").exists()
 
 
-def test_an_unreadable_frame_before_there_is_any_depth(mastd3r: Command, room_clip: Path, tmp_path: Path) -> None:
-    folder = images_of(room_clip, tmp_path / "shots", 5)
-    (folder / "003.png").write_bytes(b"")
+def test_a_folder_with_one_readable_image(mastd3r: Command, room_clip: Path, tmp_path: Path) -> None:
+    folder = images_of(room_clip, tmp_path / "shots", 2)
+    (folder / "001.png").write_bytes(b"")
     said = mastd3r(folder)
-    incomplete(said, "003.png")
+    said.refused("expected")
     assert not [name for name in ("trajectory.txt", "camera.json") if (said.folder / name).exists()]  # none is known
 
 

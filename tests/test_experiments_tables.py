@@ -189,7 +189,7 @@ def test_one_command_makes_the_table(room_clip: Path, tmp_path: Path, capfd: pyt
     assert not (tmp_path / "out").exists()
     assert main(words) == 0
     said = capfd.readouterr()
-    assert "1/1 room/ours/0" in said.err and "16 of 16 frames posed" in said.err and "missing: elsewhere" in said.err
+    assert "1/1 room/ours/0" in said.err and "16 of 16 frames tracked" in said.err and "missing: elsewhere" in said.err
     kept = {p: p.read_bytes() for p in (tmp_path / "out" / "entries").iterdir()}
     entry = json.loads(next(iter(kept.values())))
     assert entry["status"] == "complete" and entry["metrics"]["cloud_mib"] > 0 and len(entry["path"]) == 16
