@@ -23,6 +23,7 @@ from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
+from .graph.passages import retake_passages
 from .offline.job import RunJob, Tracked
 from .offline.reconstruction import Reconstruction
 from .parts import Parts, build_parts, chosen_map_device, with_map_effort
@@ -153,13 +154,14 @@ class Slam:
         return Reconstruction(job.folder.path)
 
     def end_tracking(self) -> None:
-        """After the last frame: submaps joined, loops closed, and what sees the same matched across time."""
+        """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched."""
         self._refuse_if_ended("finish")
         self._ended = True
         graph = self.graph
         self.keyframes.finish(self.state)
         for submap in sorted(graph.started):
             graph.submap = submap
+            retake_passages(graph)
             close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
         self.masks.close()

@@ -123,9 +123,11 @@ class _Estimate:
             total += cost
             problem.terms[i] = term
             # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
-            scaled = term.cross / term.hdd[:, None]
-            local_h = whole_h - scaled.T @ term.cross
-            local_b = whole_b - scaled.T @ term.bd
+            seen = term.depth_info > 0  # the rows of other points are zero
+            root = 1 / np.sqrt(term.hdd[seen])
+            scaled = term.cross[seen] * root[:, None]
+            local_h = whole_h - scaled.T @ scaled
+            local_b = whole_b - scaled.T @ (term.bd[seen] * root)
             keep = term.columns >= 0
             rows = term.columns[keep]
             np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
@@ -217,14 +219,21 @@ def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
 def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
     """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, intrinsics]: J_i = -J_j Ad(j_from_i)."""
     m, n = len(h), 6 + 6 * len(h) + N_GLOBAL
-    hess, rhs, to_local = np.zeros((n, n)), np.zeros(n), np.zeros((m, N_COLS, 6 + N_COLS))
+    to_local = np.zeros((m, N_COLS, 6 + N_COLS))  # from [pose j, intrinsics] to [pose i, pose j, intrinsics]
     to_local[:, :, 6:] = np.eye(N_COLS)
-    for k in range(m):
-        to_local[k, :6, :6] = -adjoint(j_from_i[k])
-        part = to_local[k].T @ h[k] @ to_local[k]
-        at = np.r_[0:6, 6 + 6 * k : 12 + 6 * k, n - N_GLOBAL : n]
-        hess[np.ix_(at, at)] += part
-        rhs[at] += to_local[k].T @ b[k]
+    to_local[:, :6, :6] = [-adjoint(t) for t in j_from_i]
+    part = to_local.transpose(0, 2, 1) @ h @ to_local
+    part_b = (b[:, None] @ to_local)[:, 0]
+    hess, rhs = np.zeros((n, n)), np.zeros(n)
+    ends, edge = slice(6, 6 + 6 * m), np.arange(m)
+    i, j, g = slice(0, 6), slice(6, 12), slice(12, None)  # in a part
+    last = slice(n - N_GLOBAL, n)
+    hess[i, i], hess[i, last], hess[last, last] = (part[:, r, c].sum(0) for r, c in ((i, i), (i, g), (g, g)))
+    hess[i, ends] = part[:, i, j].transpose(1, 0, 2).reshape(6, 6 * m)
+    hess[ends, last] = part[:, j, g].reshape(6 * m, N_GLOBAL)
+    hess[ends, ends].reshape(m, 6, m, 6)[edge, :, edge] = part[:, j, j]
+    hess[ends, i], hess[last, i], hess[last, ends] = hess[i, ends].T, hess[i, last].T, hess[ends, last].T
+    rhs[i], rhs[ends], rhs[last] = part_b[:, i].sum(0), part_b[:, j].reshape(-1), part_b[:, g].sum(0)
     return hess, rhs, anchor_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 

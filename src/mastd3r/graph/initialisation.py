@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.reprojection_kernels import N_GLOBAL, edge_residuals
+from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
 from ..types import USABLE_WEIGHT
 from .depth import carried
 from .factors import ReprojectionFactor
-from .intrinsics import Intrinsics
+from .intrinsics import Intrinsics, as_given
 from .keyframe_graph import KeyframeGraph
 from .observability import explained_by_turn
 from .turning import observed
@@ -57,7 +57,7 @@ def bootstrap(whole: KeyframeGraph) -> bool:
     graph = whole.part()
     turns: set[tuple[int, int]] = set()
     if whole.started:
-        graph.set_intrinsics(_given(whole.intrinsics))
+        graph.set_intrinsics(as_given(whole.intrinsics))
     else:
         seen, pairs = observed(graph, graph.members()[-LOOKED_AT:])
         if seen.kind in ("none", "rotation"):
@@ -93,24 +93,19 @@ def bootstrap(whole: KeyframeGraph) -> bool:
     return True
 
 
-def _given(intrinsics: Intrinsics) -> Intrinsics:
-    """The same, as known as if they had been given."""
-    return Intrinsics(intrinsics.values, intrinsics.values, np.full(N_GLOBAL, np.inf))
-
-
 def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> Iterator[_Start]:
     """Every start that comes to an end, those that come to the same one once; not from pairs that are ``turns``."""
     known = graph.intrinsics
     focals = first_focals(graph)
     ends: list[tuple[float, float]] = []
-    for pair in _first_pairs(graph, turns):
+    for pair in first_pairs(graph, turns):
         same = 0
         for focal_px in focals:
             first = known.prior.copy()
             if focal_px is not None:
                 first[0] = np.log(focal_px)
             graph.set_intrinsics(replace(known, values=first))
-            cost = _attempt(graph, pair)
+            cost = attempt(graph, pair)
             if cost is None:
                 continue
             log_focal = float(graph.intrinsics.values[0])
@@ -191,7 +186,7 @@ def _agreement(graph: KeyframeGraph) -> float:
     return close / max(sum(int(u.sum()) for u in used), 1)
 
 
-def _first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[ReprojectionFactor]:
+def first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[ReprojectionFactor]:
     """Pairs to start from: many matches and much image motion, best first; ``turns`` say nothing of depth."""
 
     def merit(edge: ReprojectionFactor) -> float:
@@ -203,7 +198,7 @@ def _first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[Repr
     return sorted(forward, key=merit, reverse=True)[:FIRST_PAIRS]
 
 
-def _attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
+def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
     """Two views by the essential matrix, the others one by one, then all; the robust cost, None on failure."""
     _reset(graph)
     if not _two_view(graph, pair):

@@ -38,6 +38,11 @@ RADIAL, HELD_AT_FIRST = (1, 4, 5), (2, 3, 4, 5)  # indices into g: radial terms;
 PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims too much: the prior is raised instead
 
 
+def as_given(intrinsics: Intrinsics) -> Intrinsics:
+    """The same, as known as if they had been given."""
+    return Intrinsics(intrinsics.values, intrinsics.values, np.full(N_GLOBAL, np.inf))
+
+
 def camera_of(intrinsics: Intrinsics, size: tuple[int, int]) -> Camera:
     """The camera (width, height) that they stand for; radial terms fitted to the undistortion of the solver."""
     g = intrinsics.values

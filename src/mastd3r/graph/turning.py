@@ -44,6 +44,14 @@ def observed(graph: KeyframeGraph, ids: Sequence[int]) -> tuple[Observability, l
     return found, pairs
 
 
+def turned(graph: KeyframeGraph) -> dict[int, Array]:
+    """The turn (4, 4) of every keyframe from the first that explains most of the image motion, depth left aside."""
+    variables, edges = _thinned(graph, graph.members())
+    if edges:
+        _turn(variables, edges, _lens_before(graph), graph.size)
+    return {k: v.cam_from_world for k, v in variables.items()}
+
+
 def put_at_infinity(graph: KeyframeGraph) -> None:
     """Keyframes of the submap being tracked turn about one place, every point is at infinity; the lens is theirs."""
     ids = graph.members()

@@ -1,0 +1,214 @@
+"""Passages of the chain that are explained badly, solved anew from starts that owe nothing to where tracking put them.
+
+Where a fast turn shows one plane, or depths that nothing has confirmed, the matches of a keyframe have a second
+explanation: less of a turn and more of a shift. It is a minimum of its own. No solver leaves it, every further
+keyframe is tracked from it, and the trajectory breaks there. What betrays it are residuals: the passage costs more for
+what its matches weigh than the rest of the chain.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..geometry.se3 import inverse
+from ..geometry.sim3 import Sim3
+from .factors import KeyframeVariables, ReprojectionFactor
+from .initialisation import attempt, first_pairs
+from .intrinsics import as_given
+from .keyframe_graph import KeyframeGraph
+from .turning import turned
+from .windows import ALL_INTRINSICS, Window
+
+Array = NDArray[Any]
+State = dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of keyframes
+log = logging.getLogger(__name__)
+LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
+LONGEST = 20  # of a passage made of several that touch
+MOST_POINTS = 300  # of a keyframe, for a decision
+KERNEL_PX = 0.5
+DOUBTFUL = 1.3  # times the median passage's cost a weight: looked at
+MOST_DOUBTED = 6  # passages looked at in one round, the worst first
+ROUNDS = 3
+BETTER = 0.85  # of the cost, for another explanation to be taken
+SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
+WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # the same of the whole chain, before and after a passage is changed
+DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
+
+
+def retake_passages(graph: KeyframeGraph) -> int:
+    """Try other explanations of badly explained passages of the submap being tracked; how many were taken.
+
+    One is taken where it costs less than ``BETTER`` of what the passage does, on matches of the passage alone, and
+    where it lowers the cost of the whole chain too.
+    """
+    taken, tried = 0, set[tuple[int, int]]()
+    for _ in range(ROUNDS):
+        for ids in doubtful_passages(graph):
+            if (ids[0], ids[-1]) in tried:
+                continue
+            tried.add((ids[0], ids[-1]))
+            if _retake(graph, ids):
+                taken += 1
+                break  # the passages beside it have changed
+        else:
+            break
+    return taken
+
+
+def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
+    """Passages that cost more for what their matches weigh than others, the worst first; those that touch as one."""
+    ids = graph.members()
+    if len(ids) < 2 * LENGTH:
+        return []
+    firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]
+    costs = np.array([_cost_of_weight(graph, ids[n : n + LENGTH]) for n in firsts])
+    bound = DOUBTFUL * float(np.median(costs))
+    found: list[tuple[float, list[int]]] = []
+    for n in np.flatnonzero(costs > bound):
+        found.append((costs[n], ids[firsts[n] : firsts[n] + LENGTH]))
+        if n and costs[n - 1] > bound:
+            found.append((costs[n], ids[firsts[n - 1] : firsts[n] + LENGTH]))
+    return [passage for _, passage in sorted(found, key=lambda x: -x[0])[:MOST_DOUBTED]]
+
+
+def _cost_of_weight(graph: KeyframeGraph, ids: Sequence[int]) -> float:
+    part = _thinned(graph, ids)
+    weight = sum(float(e.weight.sum()) for e in part.edges)
+    return _solved(part, ((KERNEL_PX, 4),)) / max(weight, 1e-9)
+
+
+def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
+    """Another explanation of one passage, if there is a better one."""
+    now = _thinned(graph, ids)
+    cost = _solved(now, ((KERNEL_PX, 15),))
+    best: tuple[float, State] | None = None
+    for start in (_from_turn, _from_two_views):
+        if best is not None:
+            break
+        part = _thinned(graph, ids)
+        if not start(part):
+            continue
+        found = _solved(part, SETTLING)
+        if found < BETTER * cost:
+            best = found, _state(part)
+    frames = [graph.keyframes[k].work.index for k in (ids[0], ids[-1])]
+    if best is None:
+        log.info("frames %d to %d: no better explanation than the one there is", *frames)
+        return False
+    before, kept, lens = _whole_cost(graph), _state(graph), graph.intrinsics
+    _splice(graph, ids, best[1])
+    after = _whole_cost(graph)
+    if after < before:
+        log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
+                 before, after)  # fmt: skip
+        return True
+    graph.set_intrinsics(lens)
+    for k, (pose, inv_depth) in kept.items():
+        graph.set_keyframe_pose(k, pose)
+        graph.set_depths(k, inv_depth)
+    return False
+
+
+# -- starts ------------------------------------------------------------------------------------------------------
+
+
+def _from_turn(part: KeyframeGraph) -> bool:
+    """All keyframes at one place, turned as explains most of the image motion; all points equally far."""
+    rotations = turned(part)
+    inv_depth = float(np.median(np.concatenate([v.inv_depth for v in part.variables.values()])))
+    first = min(part.variables)
+    pose = part.variables[first].cam_from_world
+    for k, v in part.variables.items():
+        part.set_keyframe_pose(k, rotations[k] @ inverse(rotations[first]) @ pose)
+        part.set_depths(k, np.full(len(v.px), inv_depth))
+    return True
+
+
+def _from_two_views(part: KeyframeGraph) -> bool:
+    """Two keyframes by their essential matrix, the others one after another."""
+    pairs = first_pairs(part, set())
+    return bool(pairs) and attempt(part, pairs[0]) is not None
+
+
+# -- a passage by itself -----------------------------------------------------------------------------------------
+
+
+def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
+    """A graph of its own of some keyframes with some of their points; its lens is given."""
+    step = max(1, max(len(graph.variables[k].px) for k in ids) // MOST_POINTS)
+    out = KeyframeGraph(graph.config, as_given(graph.intrinsics))
+    out.size, out.submap = graph.size, graph.submap
+    out.keyframes = [graph.keyframes[k] for k in ids]
+    out.submap_of = dict.fromkeys(ids, graph.submap)
+    for k in ids:
+        v = graph.variables[k]
+        inv_depth = v.inv_depth[::step]
+        info = np.full(len(inv_depth), DEPTH_PRIOR / float(np.median(v.inv_depth)) ** 2)
+        out.variables[k] = KeyframeVariables(v.px[::step], inv_depth.copy(), inv_depth.copy(), info, v.cam_from_world)
+    out.edges = [
+        ReprojectionFactor(e.i, e.j, e.target[::step], e.weight[::step]) for e in graph.edges_among(ids)
+    ]
+    return out
+
+
+def _solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
+    """The cost after steps of (kernel in pixels, iterations), the first keyframe held."""
+    cost = np.inf
+    for kernel_px, iterations in steps:
+        window = Window(list(part.variables), part.edges, frozenset([min(part.variables)]), ALL_INTRINSICS)
+        cost = part.optimise(window, iterations, kernel_px).cost_last
+    return cost
+
+
+def _whole_cost(graph: KeyframeGraph) -> float:
+    return [graph.solve_all(iterations, kernel_px) for kernel_px, iterations in WHOLE][-1].cost_last
+
+
+def _state(graph: KeyframeGraph) -> State:
+    return {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
+
+
+# -- back into the chain -----------------------------------------------------------------------------------------
+
+
+def _splice(graph: KeyframeGraph, ids: Sequence[int], state: State) -> None:
+    """Poses and depths of a passage as ``state`` (of thinned points) has them; what follows goes with its end."""
+    ratio = _length_ratio(graph, ids[:3], state)
+    end = ids[-1]
+    old_end = Sim3.from_rigid(graph.variables[end].cam_from_world)
+    grown = _length_ratio(graph, ids[-3:], state) / ratio
+    first_pose, first_new = graph.variables[ids[0]].cam_from_world, state[ids[0]][0]
+    for k in ids:
+        pose, inv_depth = state[k]
+        from_first = pose @ inverse(first_new)
+        from_first[:3, 3] /= ratio
+        graph.set_keyframe_pose(k, from_first @ first_pose)
+        graph.set_depths(k, _at_all_points(graph.variables[k].px, inv_depth * ratio))
+    # lengths of what follows: as its end's were, which have become ``1 / grown`` of what they were
+    new_end = Sim3.from_rigid(inverse(graph.variables[end].cam_from_world))
+    world_from_old = new_end @ Sim3(np.eye(3), np.zeros(3), 1 / grown) @ old_end
+    after = [k for k in graph.members() if k > end]
+    graph.transform_keyframes(after, world_from_old)
+
+
+def _at_all_points(px: Array, thinned: Array) -> Array:
+    """(p,) values at ``px`` (p, 2) from those of every n-th of them: the nearest one's."""
+    step = -(-len(px) // len(thinned))
+    return thinned[cKDTree(px[::step]).query(px)[1]]
+
+
+def _length_ratio(graph: KeyframeGraph, ids: Sequence[int], state: State) -> float:
+    """Inverse depths of some keyframes before / inverse depths in ``state``, the median."""
+    ratios = []
+    for k in ids:
+        new = state[k][1]
+        old = graph.variables[k].inv_depth[:: -(-len(graph.variables[k].inv_depth) // len(new))]
+        known = (old > 0) & (new > 0)
+        ratios.append(float(np.median(old[known] / new[known])) if known.any() else 1.0)
+    return float(np.median(ratios))
