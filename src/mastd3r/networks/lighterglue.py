@@ -36,7 +36,7 @@ class _Self(nn.Module):
 
     def forward(self, x: Tensor, turns: Tensor) -> Tensor:
         q, k, v = self.Wqkv(x).unflatten(-1, (DIM, 3)).unbind(-1)
-        message = F.scaled_dot_product_attention(_turned(q, turns)[None], _turned(k, turns)[None], v[None])[0]
+        message = _attention(_turned(q, turns), _turned(k, turns), v)
         return x + self.ffn(torch.cat([x, self.out_proj(message)], -1))
 
 
@@ -50,8 +50,7 @@ class _Cross(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         qk_a, qk_b = self.to_qk(a), self.to_qk(b)
-        alike = qk_a @ qk_b.T / DIM**0.5
-        to_a, to_b = alike.softmax(1) @ self.to_v(b), alike.softmax(0).T @ self.to_v(a)
+        to_a, to_b = _attention(qk_a, qk_b, self.to_v(b)), _attention(qk_b, qk_a, self.to_v(a))
         return self._changed(a, to_a), self._changed(b, to_b)
 
     def _changed(self, x: Tensor, message: Tensor) -> Tensor:
@@ -143,6 +142,11 @@ class LighterGlue:
         places = tuple(torch.from_numpy(((p - centre) / unit).astype(np.float32)) for p in px)
         rows, score = self.network(places, tuple(torch.from_numpy(d) for d in described))
         return rows.numpy(), score.numpy().astype(float)
+
+
+def _attention(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """(n, c) of (n, c), (m, c) and (m, c); torch's fast way wants a batch and a head."""
+    return F.scaled_dot_product_attention(query[None, None], key[None, None], value[None, None])[0, 0]
 
 
 def _turns(angles: Tensor) -> Tensor:
