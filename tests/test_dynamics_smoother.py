@@ -65,6 +65,34 @@ def test_an_empty_room_stays_static() -> None:
     assert max(m.moving.mean() for m in smoothed(frames)) < 0.005
 
 
+def test_nothing_is_said_to_move_against_a_pose_that_is_a_guess() -> None:
+    wrong = np.eye(4)
+    wrong[0, 3] = 0.4
+    frames, _ = inputs(8)
+    frames[4] = replace(frames[4], world_from_cam=frames[4].world_from_cam @ wrong)
+    told = [replace(one, pose_known=n != 4) for n, one in enumerate(frames)]
+    assert np.abs(smoothed(frames)[4].evidence["motion"]).max() > 1.0
+    masks = smoothed(told)
+    assert not masks[4].evidence["motion"].any()
+    assert masks[3].evidence["motion"].any()  # from the others
+
+
+def test_what_most_of_a_scene_lacks_is_no_mark_of_motion() -> None:
+    """Between views far apart much of a static scene has no match; a few pixels without one are a thing that moves."""
+    rng = np.random.default_rng(3)
+    gray, pose, _ = frame(0, 1e6)
+    noise = cv2.GaussianBlur(rng.integers(0, 255, gray.shape).astype(np.uint8), (0, 0), 1.5)
+    said = []
+    noise = cv2.normalize(noise, None, 0, 255, cv2.NORM_MINMAX)
+    for share in (0.3, 0.7):
+        other, columns = gray.copy(), slice(0, round(share * W))
+        other[:, columns] = noise[:, columns]
+        config = DynamicsConfig(temporal=TemporalConfig(smoother_gaps=(1,)))
+        first = smoothed([input_of(0, gray, pose), input_of(1, other, pose)], config)[0]
+        said.append(float(np.median(first.evidence["motion"][:, : W // 10])))
+    assert said[0] > 0.8 and said[1] < 0.2
+
+
 def coloured(gray: np.ndarray, moving: np.ndarray) -> np.ndarray:
     """(h, w, 3) photograph: wall and moving thing in colours of their own."""
     return (COLOURS[moving.astype(int)] * (0.5 + gray[..., None] / 510.0)).clip(0, 255).astype(np.uint8)

@@ -21,6 +21,7 @@ class MotionConfig:
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
     texture_noise: float = 4.0  # grey levels of noise that a texture has to beat
     spread_px: float = 4.0  # 1 sigma of what a moving thing adds to the flow
+    wrong_where_failed: float = 0.5  # share of wrong flow among what was found / square of the share where it failed
     round_trip_px: float = 1.5  # forward-backward error at which the flow's confidence is exp(-1/2)
     pose_sigma_deg: float = 0.3  # 1 sigma of the pose error that the motion test may take out
     noise_inflation: bool = True  # evidence weakens where the static majority fits worse than pose and depths claim

@@ -28,6 +28,7 @@ class DynamicsInput:
     semantic: Array | None = None  # (h, w) float32 P(movable)
     color: Array | None = None  # (h, w, 3) uint8 RGB; the refinement follows its edges where it is there
     features: Array | None = None  # (h', w', c) float32 descriptors of any kind, for the appearance classifier
+    pose_known: bool = True  # False: the pose is a guess, against which nothing can be said to move
 
 
 @dataclass(frozen=True)

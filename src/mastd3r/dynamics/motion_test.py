@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -105,18 +105,21 @@ class MotionTest:
         wide = along_epipolar(frame.flow_cov, rigid.slope, frame.inv_depth_sigma)
         if c.noise_inflation:
             wide = wide * np.float32(max(1.0, noise_inflation(residual, wide, inside) / c.noise_tolerance))
-        ratio = motion_log_ratio(residual, wide, self.config) * confidence
         covered = self._flow.warp(past.moving, rigid.target)
+        scene = inside * static * (1 - covered)
+        failed = 1 - float((confidence * scene).sum()) / max(float(scene.sum()), 1.0)
+        ratio = motion_log_ratio(residual, wide, self._at_failure(failed)) * confidence
         unmatched = (1 - confidence) * (1 - covered)
-        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, unmatched)
+        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, unmatched, failed)
         return Comparison(ratio.astype(np.float32), rigid.target - self._flow.grid + left)
 
     def _grey_values(
-        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array, unmatched: Array
+        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array, unmatched: Array, failed: float
     ) -> Array:
         """Static where the rigid warp fits better than the flow; moving where neither flow nor warp explains it.
 
-        What a moving thing covered in the past frame cannot match, and says nothing.
+        What a moving thing covered in the past frame cannot match, and says nothing. Nor does it say more than
+        -log ``failed`` where that share of the static scene cannot be matched: as between views far apart.
         """
         cur, still = small.astype(np.float32), stable.astype(np.float32)
         still *= float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3)
@@ -128,7 +131,13 @@ class MotionTest:
         as_flow = mismatch(cur, self._flow.warp(still, self._flow.grid + left), noise)
         unexplained = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * unmatched
         fits = np.clip(self.config.photometric.gain * (as_static - as_flow), -3, 0)
-        return self.config.photometric.unexplained_gain * unexplained + fits
+        gain = min(self.config.photometric.unexplained_gain, -np.log(max(failed, 1e-6)))
+        return np.float32(gain) * unexplained + fits
+
+    def _at_failure(self, failed: float) -> DynamicsConfig:
+        """Where flow fails for a share of the static scene, more of what it does find is wrong as well."""
+        wrong = max(self.config.outlier_share, self.config.motion.wrong_where_failed * failed**2)
+        return replace(self.config, outlier_share=wrong)
 
     def _background(self, frame: DynamicsInput) -> tuple[Array, Array]:
         """Half-size inverse depth and 1 sigma; unknown pixels get the median and a sigma as wide as the scene."""

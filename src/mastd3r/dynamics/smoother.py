@@ -114,12 +114,13 @@ class ForwardBackwardSmoother:
         present = self._test.present(frame, small, texture) if config.motion.enabled else None
         past = Past(small, frame.world_from_cam, self._nothing)
         new = _WindowFrame(frame, past, present, texture, self._nothing, depth, appearance)
-        if config.support.enabled:
+        if config.support.enabled and frame.pose_known:
             new.floating = self.refinement.shrink(floating_log_ratio(frame, config))
         return new
 
     def _compare(self, pairs: list[tuple[_WindowFrame, _WindowFrame, Array, int]]) -> None:
-        """The motion term of each (frame, other frame, P(static) of the frame, frames between them)."""
+        """The motion term of each (frame, other frame, P(static) of the frame, frames between them), of known poses."""
+        pairs = [p for p in pairs if p[0].input.pose_known and p[1].input.pose_known]
         comparable = [(one.present, static, other.past) for one, other, static, _ in pairs if one.present is not None]
         for (one, other, _, gap), found in zip(pairs, self._test.compare(comparable), strict=False):
             one.motion = one.motion + found.log_ratio

@@ -151,9 +151,7 @@ def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
         inv_depth = v.inv_depth[::step]
         info = np.full(len(inv_depth), DEPTH_PRIOR / float(np.median(v.inv_depth)) ** 2)
         out.variables[k] = KeyframeVariables(v.px[::step], inv_depth.copy(), inv_depth.copy(), info, v.cam_from_world)
-    out.edges = [
-        ReprojectionFactor(e.i, e.j, e.target[::step], e.weight[::step]) for e in graph.edges_among(ids)
-    ]
+    out.edges = [ReprojectionFactor(e.i, e.j, e.target[::step], e.weight[::step]) for e in graph.edges_among(ids)]
     return out
 
 

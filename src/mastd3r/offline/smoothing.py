@@ -166,7 +166,7 @@ def _inputs(
         if position in chosen:
             photograph = map_view.pinhole_image(frame.as_taken.image)
             uncertainty = _uncertainty(place, graph, given, flow, map_view.tau_px)
-        given = replace(given, color=small)
+        given = replace(given, color=small, pose_known=place.state in ("tracked", "started"))
         given = given if parts.provider.own_scale_known else _at_expected_scale(given)
         yield given, _Waiting(position, place, small, photograph, uncertainty)
 
