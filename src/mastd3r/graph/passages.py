@@ -9,7 +9,7 @@ what its matches weigh than the rest of the chain.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from .turning import turned
 from .windows import ALL_INTRINSICS, Window
 
 Array = NDArray[Any]
+Start = Callable[[KeyframeGraph], bool]
 State = dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of keyframes
 log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
@@ -78,23 +79,23 @@ def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
 
 
 def _cost_of_weight(graph: KeyframeGraph, ids: Sequence[int]) -> float:
-    part = _thinned(graph, ids)
+    part = thinned(graph, ids)
     weight = sum(float(e.weight.sum()) for e in part.edges)
-    return _solved(part, ((KERNEL_PX, 4),)) / max(weight, 1e-9)
+    return solved(part, ((KERNEL_PX, 4),)) / max(weight, 1e-9)
 
 
 def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
     """Another explanation of one passage, if there is a better one."""
-    now = _thinned(graph, ids)
-    cost = _solved(now, ((KERNEL_PX, 15),))
+    now = thinned(graph, ids)
+    cost = solved(now, ((KERNEL_PX, 15),))
     best: tuple[float, State] | None = None
-    for start in (_from_turn, _from_two_views):
+    for start in STARTS:
         if best is not None:
             break
-        part = _thinned(graph, ids)
+        part = thinned(graph, ids)
         if not start(part):
             continue
-        found = _solved(part, SETTLING)
+        found = solved(part, SETTLING)
         if found < BETTER * cost:
             best = found, _state(part)
     frames = [graph.keyframes[k].work.index for k in (ids[0], ids[-1])]
@@ -102,7 +103,7 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
     before, kept, lens = _whole_cost(graph), _state(graph), graph.intrinsics
-    _splice(graph, ids, best[1])
+    replace_passage(graph, ids, best[1])
     after = _whole_cost(graph)
     if after < before:
         log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
@@ -136,10 +137,13 @@ def _from_two_views(part: KeyframeGraph) -> bool:
     return bool(pairs) and attempt(part, pairs[0]) is not None
 
 
+STARTS: tuple[Start, ...] = (_from_turn, _from_two_views)
+
+
 # -- a passage by itself -----------------------------------------------------------------------------------------
 
 
-def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
+def thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
     """A graph of its own of some keyframes with some of their points; its lens is given."""
     step = max(1, max(len(graph.variables[k].px) for k in ids) // MOST_POINTS)
     out = KeyframeGraph(graph.config, as_given(graph.intrinsics))
@@ -155,7 +159,7 @@ def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
     return out
 
 
-def _solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
+def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     """The cost after steps of (kernel in pixels, iterations), the first keyframe held."""
     cost = np.inf
     for kernel_px, iterations in steps:
@@ -175,7 +179,7 @@ def _state(graph: KeyframeGraph) -> State:
 # -- back into the chain -----------------------------------------------------------------------------------------
 
 
-def _splice(graph: KeyframeGraph, ids: Sequence[int], state: State) -> None:
+def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> None:
     """Poses and depths of a passage as ``state`` (of thinned points) has them; what follows goes with its end."""
     ratio = _length_ratio(graph, ids[:3], state)
     end = ids[-1]

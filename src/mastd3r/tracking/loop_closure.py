@@ -20,7 +20,7 @@ from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
 from ..types import USABLE_WEIGHT
 from .places import most_alike, not_unlike
-from .two_view import TwoView, TwoViewEstimator
+from .two_view import TwoView, TwoViewEstimator, far_matches
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -28,6 +28,7 @@ MIN_SIMILARITY = 0.55  # of two descriptors, for a pair to be looked at
 APART = 3  # keyframes between two of one place, below: they are neighbours
 MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
 SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
+SURE_FEATURES, SURE_INLIERS_WITH = 80, 0.5  # or so many sparse features of one geometry, beside such a share
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
 MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
@@ -50,7 +51,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
         for other in [*small, *_alike(two_view, graph, j, far)]:
             there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
             back = two_view.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
-            loop = _loop(graph, other.id, j, there, back)
+            loop = _loop(two_view, other.id, j, there, back)
             if loop is None or there is None or back is None:
                 continue
             log.info("keyframes %d and %d are one place, scale %.3f", other.id, j, 1 / loop.j_from_i.scale)
@@ -83,8 +84,18 @@ def _strong(view: TwoView | None) -> bool:
     return view.alignment.inlier_ratio >= MIN_INLIERS
 
 
-def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: TwoView | None) -> Loop | None:
+def _sure(two_view: TwoViewEstimator, i: int, j: int, inlier_ratio: float) -> bool:
+    """Whether dense matches alone, or sparse features beside them, leave no doubt that two keyframes show one place."""
+    if inlier_ratio >= SURE_INLIERS:
+        return True
+    ref, new = two_view.graph.keyframes[i], two_view.graph.keyframes[j]
+    far = far_matches(two_view.parts, ref, new.work, new.moving / 255.0) if inlier_ratio >= SURE_INLIERS_WITH else None
+    return far is not None and len(far[1].ref_px) >= SURE_FEATURES
+
+
+def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, back: TwoView | None) -> Loop | None:
     """What j seen from i and i seen from j agree on; None where they do not."""
+    graph = two_view.graph
     if there is None or back is None or not (_strong(there) and _strong(back)):
         return None
     j_from_i = with_scale(graph, i, j, there.alignment.new_from_ref, there.pair.matches, there.weight)
@@ -93,7 +104,7 @@ def _loop(graph: KeyframeGraph, i: int, j: int, there: TwoView | None, back: Two
         return None
     better = there if there.alignment.inlier_ratio >= back.alignment.inlier_ratio else back
     turn = np.linalg.norm(so3_log(i_from_j.rotation @ j_from_i.rotation))
-    if better.alignment.inlier_ratio < SURE_INLIERS or turn > MAX_TURN:
+    if turn > MAX_TURN or not _sure(two_view, i, j, better.alignment.inlier_ratio):
         return None
     tracked = graph.variables[j].cam_from_world[:3, :3] @ graph.variables[i].cam_from_world[:3, :3].T
     drift = float(np.linalg.norm(so3_log(j_from_i.rotation @ tracked.T)))

@@ -1,0 +1,113 @@
+"""Passages that are explained badly: found by what they cost, solved anew, and put back into the chain."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mastd3r.geometry.se3 import inverse, se3_exp, so3_log
+from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.graph.passages import (
+    LENGTH,
+    SETTLING,
+    STARTS,
+    Start,
+    doubtful_passages,
+    replace_passage,
+    retake_passages,
+    solved,
+    thinned,
+)
+from test_graph_keyframes import graph_of
+
+Array = NDArray[Any]
+VIEWS, NEAR, BROKEN = 24, 4, 17  # keyframes, how far apart they are matched, the first that is wrong
+
+
+def chain(exact_scene: Callable[..., Any]) -> KeyframeGraph:
+    """A chain whose keyframes are matched with their neighbours alone, true but for noise."""
+    graph = graph_of(exact_scene(VIEWS, step=0.06, cell_px=12), VIEWS, noise_px=0.2, solved=True)
+    graph.edges = [e for e in graph.edges if abs(e.i - e.j) <= NEAR]
+    for v in graph.variables.values():
+        v.prior_info = np.full(len(v.px), 1e-4)
+    graph.solve_all(10, 0.5)
+    return graph
+
+
+def break_up(graph: KeyframeGraph) -> None:
+    """The last keyframes shift where they should turn, in front of a wall that leans the other way."""
+    for k in range(BROKEN, VIEWS):
+        wrong = se3_exp(np.array([-0.25, 0.1, 0.2, 0.3, 0.9, -0.2]) * (k - BROKEN + 1))
+        graph.set_keyframe_pose(k, wrong @ graph.variables[k].cam_from_world)
+        depth = graph.variables[k].inv_depth
+        graph.set_depths(k, np.maximum(2 * np.median(depth) - depth, 0.05))
+    graph.solve_all(30, 0.5)
+
+
+def off_deg(graph: KeyframeGraph, truth: dict[int, Array]) -> float:
+    """The worst turn between neighbours, against the truth."""
+    worst = 0.0
+    for a in range(VIEWS - 1):
+        found = graph.variables[a + 1].cam_from_world @ inverse(graph.variables[a].cam_from_world)
+        true = truth[a + 1] @ inverse(truth[a])
+        worst = max(worst, float(np.linalg.norm(so3_log(found[:3, :3] @ true[:3, :3].T))))
+    return float(np.degrees(worst))
+
+
+def test_a_passage_in_a_minimum_of_its_own_is_solved_anew(exact_scene: Callable[..., Any]) -> None:
+    graph = chain(exact_scene)
+    truth = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
+    assert off_deg(graph, truth) == 0.0
+    break_up(graph)
+    assert off_deg(graph, truth) > 3.0  # the solver does not leave it by itself
+    passages = doubtful_passages(graph)
+    assert passages and set(passages[0]) & set(range(BROKEN, VIEWS))
+    retake_passages(graph)
+    assert off_deg(graph, truth) < 0.3
+    length = np.linalg.norm(graph.world_from_cam(VIEWS - 1)[:3, 3] - graph.world_from_cam(VIEWS - 2)[:3, 3])
+    first = np.linalg.norm(graph.world_from_cam(1)[:3, 3] - graph.world_from_cam(0)[:3, 3])
+    a, b = (inverse(truth[k])[:3, 3] for k in (VIEWS - 1, VIEWS - 2))
+    c, d = (inverse(truth[k])[:3, 3] for k in (1, 0))
+    assert length / first == pytest.approx(np.linalg.norm(a - b) / np.linalg.norm(c - d), rel=0.1)  # one scale
+
+
+@pytest.mark.parametrize("start", STARTS)
+def test_a_passage_alone_comes_back_from_either_start(exact_scene: Callable[..., Any], start: Start) -> None:
+    graph = chain(exact_scene)
+    true_cost = solved(thinned(graph, range(14, VIEWS)), SETTLING)
+    break_up(graph)
+    part = thinned(graph, range(14, VIEWS))
+    assert solved(thinned(graph, range(14, VIEWS)), SETTLING[-1:]) > 3 * true_cost
+    assert start(part) and solved(part, SETTLING) == pytest.approx(true_cost, rel=0.02)
+
+
+def test_what_is_explained_well_stays_as_it_is(exact_scene: Callable[..., Any]) -> None:
+    graph = chain(exact_scene)
+    before = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
+    assert doubtful_passages(graph) == [] and retake_passages(graph) == 0
+    for k, pose in before.items():
+        np.testing.assert_array_equal(graph.variables[k].cam_from_world, pose)
+
+
+def test_a_short_chain_has_no_passages(exact_scene: Callable[..., Any]) -> None:
+    graph = graph_of(exact_scene(5, step=0.1), 5, solved=True)
+    assert VIEWS >= 2 * LENGTH > 5 and doubtful_passages(graph) == [] and retake_passages(graph) == 0
+
+
+def test_the_same_passage_in_another_world_and_scale_changes_nothing(exact_scene: Callable[..., Any]) -> None:
+    graph = chain(exact_scene)
+    before = {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
+    ids, elsewhere, scale = list(range(8, 18)), se3_exp(np.array([1.0, -2.0, 0.5, 0.3, 0.8, -0.4])), 2.5
+    state = {}
+    for k in ids:
+        pose = before[k][0].copy()
+        pose[:3, 3] *= scale
+        state[k] = (pose @ elsewhere, before[k][1] / scale)
+    replace_passage(graph, ids, state)
+    for k, (pose, inv_depth) in before.items():
+        np.testing.assert_allclose(graph.variables[k].cam_from_world, pose, atol=1e-9)
+        np.testing.assert_allclose(graph.variables[k].inv_depth, inv_depth, rtol=1e-9)
