@@ -32,6 +32,7 @@ from .sources.recorded import RecordedSource
 from .sources.rectified import RectifiedSource, rectified
 from .tracking.keyframes import Keyframes
 from .tracking.loop_closure import add_covisible_pairs, close_loops
+from .tracking.lost_frames import find_lost
 from .tracking.masking import MaskTracker
 from .tracking.observation import Near, Observer
 from .tracking.recovery import Recovery
@@ -164,6 +165,7 @@ class Slam:
             retake_passages(graph)
             close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
+        find_lost(self._rectified_again(), graph, Observer(self.parts), self.two_view)
         self.masks.close()
         self.keyframes.close()
 
@@ -194,6 +196,11 @@ class Slam:
         with one_blas_thread():
             yield
         self._tracked, self._tracking_s = self._tracked + 1, self._tracking_s + time.perf_counter() - began
+
+    def _rectified_again(self) -> Iterator[Frame]:
+        """The frames once more, as they were tracked."""
+        seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
+        return seen.frames()
 
     def _near(self) -> Near:
         """What the frame after the next is probably seen beside: the keyframe that is followed now."""

@@ -183,23 +183,15 @@ class KeyframeGraph:
         weight: Array,
     ) -> FrameRecord:
         """Store a frame's place; its strongest matches are kept for the final pose."""
-        keep = np.zeros(0, int)
-        if matches is not None:
-            strong = np.flatnonzero(weight > USABLE_WEIGHT)
-            keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
-        target = np.zeros((0, 2), np.float32) if matches is None else matches.new_px[keep].astype(np.float32)
-        entry = FrameRecord(
-            work.index,
-            work.timestamp_s,
-            kf_id,
-            cam_from_kf,
-            state,
-            keep,
-            target,
-            weight[keep].astype(np.float32),
-        )
+        kept = _nothing() if matches is None else _strongest(matches, weight)
+        entry = FrameRecord(work.index, work.timestamp_s, kf_id, cam_from_kf, state, *kept)
         self.records.append(entry)
         return entry
+
+    def place(self, record: FrameRecord, kf_id: int, cam_from_kf: Array, matches: Matches, weight: Array) -> None:
+        """A frame that was lost has been found: (4, 4) relative to keyframe ``kf_id``, by ``matches`` with it."""
+        record.kf_id, record.cam_from_kf, record.state = kf_id, cam_from_kf, "tracked"
+        record.points, record.target, record.weight = _strongest(matches, weight)
 
     def replace_last_by_keyframe(self, kf: Keyframe) -> None:
         """The frame recorded last has become keyframe ``kf``."""
@@ -379,6 +371,13 @@ class KeyframeGraph:
         self.normalise()
         self.last_report = report
         return report
+
+
+def _strongest(matches: Matches, weight: Array) -> tuple[Array, Array, Array]:
+    """Points, targets and weights of the matches that a frame keeps."""
+    strong = np.flatnonzero(weight > USABLE_WEIGHT)
+    keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
+    return keep, matches.new_px[keep].astype(np.float32), weight[keep].astype(np.float32)
 
 
 def _nothing() -> tuple[Array, Array, Array]:
