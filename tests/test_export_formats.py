@@ -94,6 +94,17 @@ def test_colmap_points_keep_colour_and_have_no_track(tmp_path: Path) -> None:
     assert all(len(r) == 8 and 0 <= int(r[4]) <= 255 and r[7] == "-1" for r in rows)
 
 
+def test_interpolated_poses_are_no_images_to_train_from(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    trajectory = run_folder(tmp_path / "run")
+    states = [["tracked", 2], ["interpolated", 2], ["tracked", 1]]
+    (tmp_path / "run" / "run.json").write_text(json.dumps({"status": "complete", "states": states}))
+    rows = rows_of(export_run(tmp_path / "run", "colmap", tmp_path / "model") / "images.txt")
+    assert [row[-1] for row in rows] == [f"{trajectory.timestamps_s[n]:.6f}.png" for n in (0, 1, 4)]
+    assert "2 of 5 poses are interpolated, and left out" in caplog.text
+    assert len(rows_of(export_run(tmp_path / "run", "tum", tmp_path / "t.txt"))) == 5
+    assert "2 of 5 poses are interpolated, and among the others" in caplog.text
+
+
 def test_two_focal_lengths_are_not_joined() -> None:
     text = cameras_text(dataclasses.replace(CAMERA, fy_px=530.0))
     assert text.splitlines()[1] == "1 OPENCV 640 480 519.25 530 311 243.25 0.05 0 0 0"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -20,6 +22,7 @@ from .read_run import Run, read_run
 from .run_folder import stamp
 
 Array = NDArray[Any]
+log = logging.getLogger(__name__)
 ExportKind = Literal["tum", "kitti", "colmap"]
 MAX_POINTS = 100_000  # of points3D.txt; more are thinned evenly
 SAME_FOCAL_RATIO = 1e-6  # fx and fy that differ by less are one focal length
@@ -31,7 +34,8 @@ def export_run(run_dir: Path, kind: str, out: Path) -> Path:
     """Write a run folder's result in another format; gives the path written.
 
     tum: ``out`` is a copy of trajectory.txt. kitti: a file of 12 numbers a row, the top of world_from_cam, one
-    row a frame. colmap: a folder with cameras.txt, images.txt and points3D.txt. Lengths are map units.
+    row a frame. colmap: a folder with cameras.txt, images.txt and points3D.txt, images whose pose is interpolated left
+    out: nothing can be trained from them. How many there are goes to the log. Lengths are map units.
     Raises InputError for a run that lacks what the format needs, OutputError where ``out`` cannot be written,
     ConfigError for an unknown kind.
     """
@@ -40,6 +44,11 @@ def export_run(run_dir: Path, kind: str, out: Path) -> Path:
     run = read_run(run_dir)
     if len(run.trajectory.timestamps_s) == 0:
         raise InputError(f"{run_dir}/trajectory.txt: expected at least one pose, got none")
+    tracked = run.trajectory.tracked()
+    guessed = len(run.trajectory.timestamps_s) - len(tracked.timestamps_s)
+    if guessed:
+        what = "left out" if kind == "colmap" else "among the others: states.txt of the run says which"
+        log.warning("%d of %d poses are interpolated, and %s", guessed, len(run.trajectory.timestamps_s), what)
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "tum":
@@ -47,7 +56,7 @@ def export_run(run_dir: Path, kind: str, out: Path) -> Path:
     elif kind == "kitti":
         write_text(out, kitti_text(_without_gaps(run)))
     else:
-        _write_colmap(run, out)
+        _write_colmap(replace(run, trajectory=tracked), out)
     return out
 
 
