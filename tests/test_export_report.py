@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mastd3r.export.metric_names import described, in_order, shown, summary_line
-from mastd3r.export.pictures import data_uri, difference, fitted, mask_overlay
+from mastd3r.export.pictures import MOVING_COLOUR, data_uri, difference, fitted, mask_overlay, tinted
 from mastd3r.export.plots import ground_axes, number, over_time, ticks, timing_bars, top_view
 from mastd3r.export.read_run import read_run
 from mastd3r.export.report import ReportData, report_html, write_report
@@ -250,3 +250,11 @@ def test_figures_read_well() -> None:
         "gaussians",
         "odd",
     ]
+
+
+def test_the_tint_is_its_plain_twin_to_one_level() -> None:
+    rng = np.random.default_rng(2)
+    image, level = rng.integers(0, 256, (37, 53, 3)).astype(np.uint8), rng.integers(0, 256, (37, 53)).astype(np.uint8)
+    share = (0.6 / 255 * level)[..., None]
+    plain = (0.75 * image + 0.25 * image.mean(2, keepdims=True)) * (1 - share) + np.array(MOVING_COLOUR) * share
+    assert np.abs(tinted(image, level, MOVING_COLOUR).astype(float) - plain).max() <= 1.0
