@@ -8,10 +8,12 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import se3_exp
 from mastd3r.sources.room import camera_pose
+from mastd3r.tracking import keyframes
 from test_submaps import Room, play, views_of
 
 Array = NDArray[Any]
@@ -46,3 +48,16 @@ def test_what_passes_in_front_makes_no_keyframes() -> None:
     slam = play(frames).slam
     assert len(slam.graph.keyframes) >= 4
     assert max(r.index for r in slam.graph.records if r.is_keyframe) <= 16
+
+
+def slow(time_s: float) -> Array:
+    """A fifteenth of the usual pace."""
+    return camera_pose(time_s / 15)
+
+
+def test_a_slow_camera_starts_by_less_motion_once_it_has_waited(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = views_of(60, slow)
+    found = [kf.work.index for kf in play(views).slam.graph.keyframes]
+    assert len(found) == 3 and np.diff(found).max() >= keyframes.SLOW_FRAMES
+    monkeypatch.setattr(keyframes, "SLOW_MOTION", 1.0)
+    assert len(play(views).slam.graph.keyframes) < len(found)

@@ -33,6 +33,7 @@ WHOLE_ITERATIONS, WHOLE_KERNEL_PX = 6, 1.0  # of that solve
 DEPTH_KNOWN = 0.1  # share of a first keyframe's points with a measured depth, above: it needs no parallax
 KNOWN_PLACE_MATCHED = 0.4  # share of an older keyframe's points matched, above: it is followed instead of a new one
 THIN_MOTION = 0.4  # of a keyframe's motion: where matches are thin that is enough
+SLOW_MOTION, SLOW_FRAMES = 0.5, 15  # of the motion before a start, and the frames after which it is enough
 LAST_MOTION = 0.3  # of the same: enough for the last frame of the video
 
 
@@ -80,9 +81,14 @@ class Keyframes:
     def _wanted(self, state: TrackingState, view: TwoView) -> bool:
         t = self.config.tracking
         thin = view.matched < t.keyframe_overlap_ratio * state.most_matched
-        enough = t.keyframe_motion_ratio if self.graph.initialised else t.first_motion_ratio
+        enough = t.keyframe_motion_ratio if self.graph.initialised else self._enough_to_start(view.anchor, state)
         # something that passes in front thins the matches too, but from the same place nothing is gained
         return view.motion_ratio > enough or (thin and view.motion_ratio > THIN_MOTION * enough)
+
+    def _enough_to_start(self, anchor: Keyframe, state: TrackingState) -> float:
+        """Image motion of a first keyframe: less where the camera is slow, or a short clip never has enough."""
+        waited = 0 if state.last is None else state.last.work.index - anchor.work.index
+        return self.config.tracking.first_motion_ratio * (SLOW_MOTION if waited >= SLOW_FRAMES else 1.0)
 
     def _known_place(self, state: TrackingState) -> TrackingState | None:
         """Where an older keyframe sees the same from nearby, frames hang on that one, and nothing is added."""
