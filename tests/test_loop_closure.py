@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
 from mastd3r.tracking.loop_closure import add_covisible_pairs, close_loops
-from mastd3r.tracking.two_view import TwoView
-from mastd3r.types import PairPrediction, Pointmap
+from mastd3r.tracking.places import TURN_AT_ONCE, plausible_turn
+from mastd3r.tracking.two_view import SURE_FEATURES, SURE_INLIERS, TwoView, TwoViewEstimator
+from mastd3r.types import FeatureMatches, PairPrediction, Pointmap
 
 Array = NDArray[Any]
 VIEWS, WEAK, DRIFT = 12, 6, 1.8
@@ -157,6 +159,9 @@ class Recognises:
         i, j = self.pair
         return [graph.keyframes[i]] if seen.index == j and i in among else []
 
+    def beyond_doubt(self, view: TwoView, work: Any, prior: Any) -> bool:
+        return view.alignment.inlier_ratio >= SURE_INLIERS
+
     def relocalised(self, kf: Any, work: Any, prior: Array) -> TwoView | None:
         i, j = kf.id, work.index
         self.compared.append((i, j))
@@ -232,3 +237,31 @@ def test_what_only_looks_alike_is_not_believed(scene: Any, spoilt: dict[str, flo
     assert front.compared and not graph.connected(2, 9)
     for k, pose in enumerate(poses):
         np.testing.assert_array_equal(graph.variables[k].cam_from_world, pose)
+
+
+@pytest.mark.parametrize(
+    ("inliers", "features", "sure"),
+    [(0.8, 0, True), (0.6, 100, True), (0.6, 60, False), (0.6, 0, False), (0.4, 200, False)],
+)
+def test_doubt_is_dispelled_by_dense_matches_or_by_features(inliers: float, features: int, sure: bool) -> None:
+    view: Any = SimpleNamespace(anchor=None, alignment=SimpleNamespace(inlier_ratio=inliers))
+    px = np.zeros((features, 2))
+    far = (None, FeatureMatches(px, px, np.ones(features))) if features else None
+    estimator: Any = SimpleNamespace(_far=lambda *_: far)
+    assert SURE_FEATURES == 80 and TwoViewEstimator.beyond_doubt(estimator, view, None, None) == sure  # type: ignore[arg-type]
+
+
+def test_a_camera_does_not_turn_round_from_one_frame_to_the_next(scene: Any) -> None:
+    graph, _ = drifted(scene)
+    index, pose = VIEWS, graph.records[-1].cam_from_kf @ graph.variables[VIEWS - 1].cam_from_world
+
+    def seen(turn: float, kf: int) -> Any:
+        found = se3_exp(np.array([0, 0, 0, 0, turn, 0])) @ pose @ inverse(graph.variables[kf].cam_from_world)
+        return SimpleNamespace(anchor=graph.keyframes[kf], alignment=SimpleNamespace(new_from_ref=found))
+
+    for kf in (2, VIEWS - 1):
+        assert plausible_turn(graph, index, seen(0.9 * TURN_AT_ONCE, kf))
+        assert not plausible_turn(graph, index, seen(2.5, kf))
+        assert plausible_turn(graph, index + 30, seen(2.5, kf))  # after a while it may be anywhere
+    graph.started.clear()
+    assert plausible_turn(graph, index, seen(2.5, 2))  # no poses yet, nothing to tell

@@ -31,7 +31,7 @@ def join_recognised(
     candidates += [k for k in most_alike(two_view.parts, graph, kf.work, others) if k.id not in known]
     for other in candidates:
         view = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
-        if view is None:
+        if view is None or not two_view.beyond_doubt(view, kf.work, Future.done(kf.moving / 255.0)):
             continue
         pose = view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)

@@ -20,15 +20,13 @@ from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
 from ..types import USABLE_WEIGHT
 from .places import most_alike, not_unlike
-from .two_view import TwoView, TwoViewEstimator, far_matches
+from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_SIMILARITY = 0.55  # of two descriptors, for a pair to be looked at
 APART = 3  # keyframes between two of one place, below: they are neighbours
 MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
-SURE_INLIERS = 0.75  # of the better way, whose pose is taken: depths of one end may be poor where drift began
-SURE_FEATURES, SURE_INLIERS_WITH = 80, 0.5  # or so many sparse features of one geometry, beside such a share
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
 MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
@@ -84,15 +82,6 @@ def _strong(view: TwoView | None) -> bool:
     return view.alignment.inlier_ratio >= MIN_INLIERS
 
 
-def _sure(two_view: TwoViewEstimator, i: int, j: int, inlier_ratio: float) -> bool:
-    """Whether dense matches alone, or sparse features beside them, leave no doubt that two keyframes show one place."""
-    if inlier_ratio >= SURE_INLIERS:
-        return True
-    ref, new = two_view.graph.keyframes[i], two_view.graph.keyframes[j]
-    far = far_matches(two_view.parts, ref, new.work, new.moving / 255.0) if inlier_ratio >= SURE_INLIERS_WITH else None
-    return far is not None and len(far[1].ref_px) >= SURE_FEATURES
-
-
 def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, back: TwoView | None) -> Loop | None:
     """What j seen from i and i seen from j agree on; None where they do not."""
     graph = two_view.graph
@@ -104,7 +93,8 @@ def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, bac
         return None
     better = there if there.alignment.inlier_ratio >= back.alignment.inlier_ratio else back
     turn = np.linalg.norm(so3_log(i_from_j.rotation @ j_from_i.rotation))
-    if turn > MAX_TURN or not _sure(two_view, i, j, better.alignment.inlier_ratio):
+    new = graph.keyframes[j if better is there else i]  # depths of one end may be poor where drift began
+    if turn > MAX_TURN or not two_view.beyond_doubt(better, new.work, Future.done(new.moving / 255.0)):
         return None
     tracked = graph.variables[j].cam_from_world[:3, :3] @ graph.variables[i].cam_from_world[:3, :3].T
     drift = float(np.linalg.norm(so3_log(j_from_i.rotation @ tracked.T)))

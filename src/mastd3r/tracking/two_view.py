@@ -24,6 +24,8 @@ from .state import TrackingState
 
 Array = NDArray[Any]
 Far = FeatureMatches | None
+SURE_INLIERS = 0.75  # of dense matches alone
+SURE_FEATURES, SURE_INLIERS_WITH = 80, 0.5  # or so many sparse features of one geometry, beside such a share
 THIN = 0.3  # share of a keyframe's static points that are matched, below: another start is tried
 
 
@@ -110,6 +112,17 @@ class TwoViewEstimator:
             return None
         view = self.estimate(kf, work, prior, start, np.eye(4), features)
         return view if self.accepted(view) else None
+
+    def beyond_doubt(self, view: TwoView, work: WorkFrame, prior: Future[Array]) -> bool:
+        """Whether dense matches alone, or sparse features beside them, leave no doubt that a view shows one place.
+
+        For where nothing else speaks for it: what moves, and two things that look alike, agree on a pose as well.
+        """
+        ratio = view.alignment.inlier_ratio
+        if ratio >= SURE_INLIERS or ratio < SURE_INLIERS_WITH:
+            return ratio >= SURE_INLIERS
+        far = self._far(view.anchor, work, prior)
+        return far is not None and len(far[1].ref_px) >= SURE_FEATURES
 
     def _started(self, ref: Keyframe) -> bool:
         return self.graph.submap_of[ref.id] in self.graph.started
