@@ -252,9 +252,9 @@ def test_figures_read_well() -> None:
     ]
 
 
-def test_the_tint_is_its_plain_twin_to_one_level() -> None:
+def test_the_tint_is_its_plain_twin_but_for_rounding() -> None:
     rng = np.random.default_rng(2)
     image, level = rng.integers(0, 256, (37, 53, 3)).astype(np.uint8), rng.integers(0, 256, (37, 53)).astype(np.uint8)
     share = (0.6 / 255 * level)[..., None]
     plain = (0.75 * image + 0.25 * image.mean(2, keepdims=True)) * (1 - share) + np.array(MOVING_COLOUR) * share
-    assert np.abs(tinted(image, level, MOVING_COLOUR).astype(float) - plain).max() <= 1.0
+    assert np.abs(tinted(image, level, MOVING_COLOUR).astype(float) - plain).max() <= 1.5
