@@ -19,7 +19,7 @@ from mastd3r.export.read_run import read_run
 from mastd3r.export.report import ReportData, report_html
 from mastd3r.geometry.se3 import inverse, se3_exp, so3_exp, so3_log, transform
 from mastd3r.graph.focal_sigma import SYSTEMATIC, focal_knowledge
-from mastd3r.graph.initialisation import _first_pairs, bootstrap
+from mastd3r.graph.initialisation import first_pairs, bootstrap
 from mastd3r.graph.intrinsics import PRIOR_FOCAL_SIGMA, intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.observability import PairMotion, explained_by_turn, noise_of, observability
@@ -190,7 +190,7 @@ def test_a_turn_followed_by_a_walk_starts_with_the_walk(scene: Any) -> None:
     assert seen.kind == "parallax"
     turns = {(p.ref, p.new) for p in pairs if explained_by_turn(p, seen.noise_px, graph.size)}
     assert {(i, j) for i, j in turns if i < j} == {(0, 1), (0, 2), (1, 2)}
-    assert not turns & {(e.i, e.j) for e in _first_pairs(graph, turns)}
+    assert not turns & {(e.i, e.j) for e in first_pairs(graph, turns)}
     assert bootstrap(graph)
     seen = finish_graph(graph, Config())
     assert seen is not None and seen.kind == "parallax"

@@ -21,6 +21,7 @@ class MotionConfig:
     flow_noise_px: float = 0.25  # 1 sigma of the flow where the image has texture
     texture_noise: float = 4.0  # grey levels of noise that a texture has to beat
     spread_px: float = 4.0  # 1 sigma of what a moving thing adds to the flow
+    doubts_unmatched: bool = True  # evidence weakens with the share of the static scene that finds no match
     wrong_where_failed: float = 0.5  # share of wrong flow among what was found / square of the share where it failed
     round_trip_px: float = 1.5  # forward-backward error at which the flow's confidence is exp(-1/2)
     pose_sigma_deg: float = 0.3  # 1 sigma of the pose error that the motion test may take out
@@ -135,5 +136,9 @@ class DynamicsConfig:
     paper: PaperConfig = field(default_factory=PaperConfig)
 
     def while_tracking(self) -> DynamicsConfig:
-        """A pose needs every static point that there is: a semantic map is believed where it shows nothing."""
-        return replace(self, semantic=replace(self.semantic, missed=self.semantic.floor))
+        """A pose needs every static point that there is: a semantic map is believed where it shows nothing.
+
+        And it needs what moves kept out: at a fast turn, too, what finds no match is held to move.
+        """
+        semantic = replace(self.semantic, missed=self.semantic.floor)
+        return replace(self, semantic=semantic, motion=replace(self.motion, doubts_unmatched=False))
