@@ -19,7 +19,7 @@ from mastd3r.export.read_run import read_run
 from mastd3r.export.report import ReportData, report_html
 from mastd3r.geometry.se3 import inverse, se3_exp, so3_exp, so3_log, transform
 from mastd3r.graph.focal_sigma import SYSTEMATIC, focal_knowledge
-from mastd3r.graph.initialisation import first_pairs, bootstrap
+from mastd3r.graph.initialisation import bootstrap, first_pairs
 from mastd3r.graph.intrinsics import PRIOR_FOCAL_SIGMA, intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.observability import PairMotion, explained_by_turn, noise_of, observability
