@@ -14,6 +14,9 @@ from mastd3r.dynamics.appearance import AppearanceClassifier, plain_descriptors
 from mastd3r.dynamics.config import AppearanceConfig, DynamicsConfig, TemporalConfig
 from mastd3r.dynamics.data import DynamicMask, DynamicsInput
 from mastd3r.dynamics.filter import LogOddsFilter
+from mastd3r.dynamics.flow import HalfFlow
+from mastd3r.dynamics.motion import texture_information
+from mastd3r.dynamics.motion_test import MotionTest, Past
 from mastd3r.dynamics.smoother import ForwardBackwardSmoother
 from mastd3r.offline.point_votes import PointVotes
 from test_dynamics_filter import CAMERA, THING, H, W, frame, input_of, iou
@@ -91,6 +94,27 @@ def test_what_most_of_a_scene_lacks_is_no_mark_of_motion() -> None:
         first = smoothed([input_of(0, gray, pose), input_of(1, other, pose)], config)[0]
         said.append(float(np.median(first.evidence["motion"][:, : W // 10])))
     assert said[0] > 0.8 and said[1] < 0.2
+
+
+def unmatched_ratio(share: float, config: DynamicsConfig) -> float:
+    """Median log ratio of one comparison where a share of a static picture has no match, nothing known before."""
+    gray, pose, _ = frame(0, 1e6)
+    now, other = cv2.resize(gray, (W // 2, H // 2)), cv2.resize(gray, (W // 2, H // 2))
+    noise = np.random.default_rng(3).integers(0, 255, other.shape).astype(np.uint8)
+    noise = cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 1.0), None, 0, 255, cv2.NORM_MINMAX)
+    columns = slice(0, round(share * W / 2))
+    other[:, columns] = noise[:, columns]
+    nothing = np.zeros(now.shape, np.float32)
+    test = MotionTest(config, HalfFlow(W // 2, H // 2), W // 2, H // 2)
+    present = test.present(input_of(0, gray, pose), now, texture_information(now, 7, config.motion.texture_noise))
+    found = test.compare([(present, nothing + 1, Past(other, pose, nothing))])[0]
+    return float(np.median(found.log_ratio[:, : W // 20]))
+
+
+def test_the_more_of_a_scene_has_no_match_the_less_that_says_but_not_while_tracking() -> None:
+    doubting, tracking = DynamicsConfig(), DynamicsConfig().while_tracking()
+    assert unmatched_ratio(0.3, doubting) == unmatched_ratio(0.3, tracking) > 1.0
+    assert unmatched_ratio(0.5, doubting) < 0.8 * unmatched_ratio(0.5, tracking)  # a pose needs what moves kept out
 
 
 def coloured(gray: np.ndarray, moving: np.ndarray) -> np.ndarray:

@@ -111,3 +111,12 @@ def test_the_same_passage_in_another_world_and_scale_changes_nothing(exact_scene
     for k, (pose, inv_depth) in before.items():
         np.testing.assert_allclose(graph.variables[k].cam_from_world, pose, atol=1e-9)
         np.testing.assert_allclose(graph.variables[k].inv_depth, inv_depth, rtol=1e-9)
+
+
+def test_measured_depths_have_a_scale_that_is_not_ours_to_change(exact_scene: Callable[..., Any]) -> None:
+    graph = chain(exact_scene)
+    break_up(graph)
+    assert doubtful_passages(graph)
+    for v in graph.variables.values():
+        v.prior_info = 100.0 / np.maximum(v.inv_depth, 1e-3) ** 2
+    assert graph.depths_measured and doubtful_passages(graph) == [] and retake_passages(graph) == 0

@@ -11,6 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mastd3r.alignment.result import Alignment
+from mastd3r.concurrency import Future
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import Sim3, procrustes
@@ -18,8 +19,10 @@ from mastd3r.graph.covisibility import overlap, overlaps
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
+from mastd3r.tracking.joining import join_recognised
 from mastd3r.tracking.loop_closure import add_covisible_pairs, close_loops
 from mastd3r.tracking.places import TURN_AT_ONCE, plausible_turn
+from mastd3r.tracking.recovery import Recovery
 from mastd3r.tracking.two_view import SURE_FEATURES, SURE_INLIERS, TwoView, TwoViewEstimator
 from mastd3r.types import FeatureMatches, PairPrediction, Pointmap
 
@@ -265,3 +268,32 @@ def test_a_camera_does_not_turn_round_from_one_frame_to_the_next(scene: Any) -> 
         assert plausible_turn(graph, index + 30, seen(2.5, kf))  # after a while it may be anywhere
     graph.started.clear()
     assert plausible_turn(graph, index, seen(2.5, 2))  # no poses yet, nothing to tell
+
+
+@pytest.mark.parametrize(("turn", "sure", "found"), [(0.1, False, True), (2.5, False, False), (2.5, True, True)])
+def test_a_lost_frame_is_not_found_where_the_camera_cannot_be(scene: Any, turn: float, sure: bool, found: bool) -> None:
+    graph, _ = drifted(scene)
+    pose = graph.records[-1].cam_from_kf @ graph.variables[VIEWS - 1].cam_from_world
+    new_from_ref = se3_exp(np.array([0, 0, 0, 0, turn, 0])) @ pose @ inverse(graph.variables[2].cam_from_world)
+    view = SimpleNamespace(anchor=graph.keyframes[2], alignment=SimpleNamespace(new_from_ref=new_from_ref))
+    eyes: Any = SimpleNamespace(relocalised=lambda *_: view, beyond_doubt=lambda *_: sure)
+    recovery = Recovery(None, graph, eyes, None)  # type: ignore[arg-type]
+    work: Any = SimpleNamespace(index=VIEWS)
+    assert (recovery._relocalised([graph.keyframes[2]], work, Future.done(np.zeros(1))) is view) == found
+
+
+def test_pieces_are_not_joined_by_a_view_in_doubt(scene: Any) -> None:
+    graph, _ = drifted(scene)
+    asked: list[int] = []
+
+    def doubted(view: Any, work: Any, prior: Any) -> bool:
+        asked.append(work.index)
+        return False
+
+    graph.started.add(1)
+    graph.submap_of[VIEWS - 1] = 1
+    parts = SimpleNamespace(features=SimpleNamespace(alike=lambda _, others: np.full(len(others), np.nan)))
+    eyes: Any = SimpleNamespace(parts=parts, relocalised=lambda *_: SimpleNamespace(), beyond_doubt=doubted)
+    places: Any = SimpleNamespace(best=lambda graph, work, ids: [graph.keyframes[ids[0]]])
+    assert not join_recognised(graph, graph.latest, eyes, None, places)  # type: ignore[arg-type]
+    assert asked == [VIEWS - 1] and graph.submap_of[VIEWS - 1] == 1

@@ -85,11 +85,11 @@ class Slam:
         self.recorded = None if source is not None else _recorded(self.config, size)
         self.source: Source = source if source is not None else self.recorded  # type: ignore[assignment]
         self.rectifier = rectifier_for(given, self.source.size)
-        seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
-        self.parts = parts if parts is not None else build_parts(self.config, seen)
+        self.seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
+        self.parts = parts if parts is not None else build_parts(self.config, self.seen)
         self.map_device = chosen_map_device(self.config.mapping, self.parts.notes)
         self.config = with_map_effort(self.config, self.source.size, self.map_device, self.parts.notes)
-        self.graph = _empty_graph(self.config, self.parts, self.rectifier, seen)
+        self.graph = _empty_graph(self.config, self.parts, self.rectifier, self.seen)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
         self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)
         self.recovery = Recovery(self.parts, self.graph, self.two_view, self.keyframes)
@@ -165,7 +165,7 @@ class Slam:
             retake_passages(graph)
             close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
-        find_lost(self._rectified_again(), graph, Observer(self.parts), self.two_view)
+        find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view)
         self.masks.close()
         self.keyframes.close()
 
@@ -196,11 +196,6 @@ class Slam:
         with one_blas_thread():
             yield
         self._tracked, self._tracking_s = self._tracked + 1, self._tracking_s + time.perf_counter() - began
-
-    def _rectified_again(self) -> Iterator[Frame]:
-        """The frames once more, as they were tracked."""
-        seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
-        return seen.frames()
 
     def _near(self) -> Near:
         """What the frame after the next is probably seen beside: the keyframe that is followed now."""

@@ -169,13 +169,14 @@ class Trajectory:
 
     def keyframes(self) -> Trajectory:
         """The rows that are keyframes."""
-        return self._rows(np.flatnonzero(self.is_keyframe))
+        return self.rows(np.flatnonzero(self.is_keyframe))
 
     def tracked(self) -> Trajectory:
         """The rows whose pose was seen, not interpolated."""
-        return self._rows(np.flatnonzero([s in ("started", "tracked") for s in self.states]))
+        return self.rows(np.flatnonzero([s in ("started", "tracked") for s in self.states]))
 
-    def _rows(self, keep: Array) -> Trajectory:
+    def rows(self, keep: Array) -> Trajectory:
+        """The rows with these indices (m,)."""
         return Trajectory(
             self.timestamps_s[keep],
             self.world_from_cam[keep],

@@ -106,9 +106,9 @@ class MotionTest:
         if c.noise_inflation:
             wide = wide * np.float32(max(1.0, noise_inflation(residual, wide, inside) / c.noise_tolerance))
         covered = self._flow.warp(past.moving, rigid.target)
-        scene = inside * static * (1 - covered)
         failed = 0.0
         if c.doubts_unmatched:
+            scene = inside * static * (1 - covered)
             failed = 1 - float((confidence * scene).sum()) / max(float(scene.sum()), 1.0)
         ratio = motion_log_ratio(residual, wide, self._at_failure(failed)) * confidence
         unmatched = (1 - confidence) * (1 - covered)

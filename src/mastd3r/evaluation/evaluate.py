@@ -92,12 +92,7 @@ def evaluate_trajectory(trajectory: Trajectory, truth: Truth | None, timestamps_
     if truth is None or not len(truth.timestamps_s):
         raise InputError("expected a sequence with true poses, got one without")
     finite = np.isfinite(trajectory.world_from_cam).all((1, 2)) & np.isfinite(trajectory.timestamps_s)
-    found = Trajectory(
-        trajectory.timestamps_s[finite],
-        trajectory.world_from_cam[finite],
-        tuple(s for s, f in zip(trajectory.states, finite, strict=True) if f),
-        trajectory.is_keyframe[finite],
-    )
+    found = trajectory.rows(np.flatnonzero(finite))
     posed, _ = associate(timestamps_s, found.timestamps_s, SAME_TIME_S)
     if not len(posed):
         raise InputError(_why_no_time(timestamps_s, found.timestamps_s))

@@ -15,7 +15,7 @@ from ..types import FeatureMatches
 from .verification import is_static, of_one_geometry
 
 Array = NDArray[Any]
-MOST_FEATURES = 1024  # of an image; those found best. With 768 cabinet breaks where little can be seen
+MOST_FEATURES = 1024  # of an image; those found best
 MIN_MATCHES = 25  # that agree on one geometry
 FEATURES_OF_A_PLACE, SAME_FEATURE = 200, 0.85  # that are compared, and the cosine above which two are the same
 KEPT_IMAGES, KEPT_PAIRS = 256, 256  # that are remembered: a pair is asked both ways, and again as keyframes

@@ -108,6 +108,12 @@ class KeyframeGraph:
         seen = v.depth_info > 0 if len(v.depth_info) else np.zeros(len(v.inv_depth), bool)
         return float(np.median(v.inv_depth[seen] if seen.sum() > 10 else v.inv_depth))
 
+    @property
+    def depths_measured(self) -> bool:
+        """True where depths have strong priors: the scale is theirs."""
+        first = [self.variables[k] for k in sorted(self.variables)[:3]]
+        return any((v.prior_info * v.inv_depth**2 > 25).mean() > 0.1 for v in first)
+
     def connected(self, i: int, j: int) -> bool:
         """True where matches of one in the other are edges."""
         return any({e.i, e.j} == {i, j} for e in self.edges)
@@ -304,8 +310,7 @@ class KeyframeGraph:
 
         Where depths are measured (strong priors) the scale is theirs and nothing is done.
         """
-        first = [self.variables[k] for k in sorted(self.variables)[:3]]
-        if any((v.prior_info * v.inv_depth**2 > 25).mean() > 0.1 for v in first):
+        if self.depths_measured:
             return
         m = float(np.median([self.median_inv_depth(k) for k in sorted(self.variables)[:3]]))
         if not np.isfinite(m) or m <= 0:

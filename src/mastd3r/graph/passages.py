@@ -30,7 +30,6 @@ Start = Callable[[KeyframeGraph], bool]
 State = dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of keyframes
 log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
-LONGEST = 20  # of a passage made of several that touch
 MOST_POINTS = 300  # of a keyframe, for a decision
 KERNEL_PX = 0.5
 DOUBTFUL = 1.3  # times the median passage's cost a weight: looked at
@@ -63,9 +62,12 @@ def retake_passages(graph: KeyframeGraph) -> int:
 
 
 def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
-    """Passages that cost more for what their matches weigh than others, the worst first; those that touch as one."""
+    """Passages that cost more for what their matches weigh than others, the worst first; those that touch as one.
+
+    None where depths are measured: their scale is not ours to change, and a passage by itself does not know it.
+    """
     ids = graph.members()
-    if len(ids) < 2 * LENGTH:
+    if len(ids) < 2 * LENGTH or graph.depths_measured:
         return []
     firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]
     costs = np.array([_cost_of_weight(graph, ids[n : n + LENGTH]) for n in firsts])
@@ -121,12 +123,11 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
 
 def _from_turn(part: KeyframeGraph) -> bool:
     """All keyframes at one place, turned as explains most of the image motion; all points equally far."""
-    rotations = turned(part)
+    cam_from_first = turned(part)
     inv_depth = float(np.median(np.concatenate([v.inv_depth for v in part.variables.values()])))
-    first = min(part.variables)
-    pose = part.variables[first].cam_from_world
+    first_from_world = part.variables[min(part.variables)].cam_from_world
     for k, v in part.variables.items():
-        part.set_keyframe_pose(k, rotations[k] @ inverse(rotations[first]) @ pose)
+        part.set_keyframe_pose(k, cam_from_first[k] @ first_from_world)
         part.set_depths(k, np.full(len(v.px), inv_depth))
     return True
 

@@ -45,7 +45,7 @@ def observed(graph: KeyframeGraph, ids: Sequence[int]) -> tuple[Observability, l
 
 
 def turned(graph: KeyframeGraph) -> dict[int, Array]:
-    """The turn (4, 4) of every keyframe from the first that explains most of the image motion, depth left aside."""
+    """cam_from_first (4, 4), of rotation alone, of every keyframe: what explains most image motion without depth."""
     variables, edges = _thinned(graph, graph.members())
     if edges:
         _turn(variables, edges, _lens_before(graph), graph.size)

@@ -9,7 +9,7 @@ from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.submaps import join, with_scale
 from .covisibility import CovisibilityEdges
-from .places import most_alike
+from .places import candidates
 from .two_view import TwoViewEstimator
 
 log = logging.getLogger(__name__)
@@ -26,12 +26,10 @@ def join_recognised(
     """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
     own = graph.submap_of[kf.id]
     others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
-    candidates = places.best(graph, kf.work, others)
-    known = {c.id for c in candidates}
-    candidates += [k for k in most_alike(two_view.parts, graph, kf.work, others) if k.id not in known]
-    for other in candidates:
-        view = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
-        if view is None or not two_view.beyond_doubt(view, kf.work, Future.done(kf.moving / 255.0)):
+    moving = Future.done(kf.moving / 255.0)
+    for other in candidates(places, two_view.parts, graph, kf.work, others):
+        view = two_view.relocalised(other, kf.work, moving)
+        if view is None or not two_view.beyond_doubt(view, kf.work, moving):
             continue
         pose = view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..geometry.se3 import so3_log
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
+from ..graph.place_recognition import PlaceRecognition
 from ..parts import Parts
 from ..types import WorkFrame
 from .two_view import TwoView
@@ -32,6 +33,15 @@ def most_alike(
     share = parts.features.alike(work.gray, [graph.keyframes[k].work.gray for k in ids])
     first = np.argsort(-np.nan_to_num(share), kind="stable")[:count]
     return [graph.keyframes[ids[n]] for n in first if share[n] >= MIN_ALIKE]
+
+
+def candidates(
+    places: PlaceRecognition, parts: Parts, graph: KeyframeGraph, work: WorkFrame, among: Sequence[int]
+) -> list[Keyframe]:
+    """Keyframes of ``among`` that may show a frame's place, by small pictures, then by features."""
+    found = places.best(graph, work, list(among))
+    known = {kf.id for kf in found}
+    return [*found, *(kf for kf in most_alike(parts, graph, work, among) if kf.id not in known)]
 
 
 def plausible_turn(graph: KeyframeGraph, index: int, view: TwoView) -> bool:

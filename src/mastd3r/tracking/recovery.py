@@ -15,7 +15,7 @@ from ..parts import Parts
 from ..types import WorkFrame
 from .keyframes import Keyframes
 from .observation import Observation
-from .places import most_alike, plausible_turn
+from .places import candidates, plausible_turn
 from .state import Status, TrackingState, status_in
 from .two_view import THIN, TwoView, TwoViewEstimator, matched_share
 
@@ -75,10 +75,10 @@ class Recovery:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
         graph, before = self.graph, state.anchor_before_loss
         ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
-        candidates = self._candidates(work, ids)
+        places = candidates(self.parts.places, self.parts, graph, work, ids)
         if before is not None:
-            candidates = [before, *(kf for kf in candidates if kf.id != before.id)]
-        view = self._relocalised(candidates, work, prior)
+            places = [before, *(kf for kf in places if kf.id != before.id)]
+        view = self._relocalised(places, work, prior)
         if view is None:
             return None
         graph.drop_submap()
@@ -93,14 +93,8 @@ class Recovery:
         assert anchor is not None
         if near is not None:
             return state, near
-        places = self._candidates(work, graph.members())
+        places = candidates(self.parts.places, self.parts, graph, work, graph.members())
         return state, self._relocalised([anchor, *(p for p in places if p.id != anchor.id)], work, prior)
-
-    def _candidates(self, work: WorkFrame, ids: list[int]) -> list[Keyframe]:
-        """Keyframes that may show the frame's place, by small pictures, then by features."""
-        found = self.parts.places.best(self.graph, work, ids)
-        known = {kf.id for kf in found}
-        return [*found, *(k for k in most_alike(self.parts, self.graph, work, ids) if k.id not in known)]
 
     def _relocalised(self, candidates: list[Keyframe], work: WorkFrame, prior: Future[Array]) -> TwoView | None:
         """The frame seen from the first of these keyframes that sees it."""
