@@ -80,9 +80,16 @@ def unreadable_record(root: Path) -> tuple[Path, list[Path]]:
     return folder, []
 
 
+def somebodys_unfinished_folder(root: Path) -> tuple[Path, list[Path]]:
+    folder = finished_run(root / "run")
+    (folder / "unfinished").mkdir()
+    (folder / "unfinished" / "trajectory.txt").write_text("a novel")
+    return folder, []
+
+
 CASES = (
     holds_the_video, is_the_source, masks_of_a_run, lies_in_the_source, through_a_link, another_tools_record,
-    linked_masks, unreadable_record,
+    linked_masks, unreadable_record, somebodys_unfinished_folder,
 )  # fmt: skip
 
 
@@ -108,8 +115,10 @@ def test_what_a_run_leaves_that_was_stopped_at_once_is_no_obstacle(tmp_path: Pat
     folder = tmp_path / "run"
     for name in FOLDERS:
         (folder / name).mkdir(parents=True)
-    (folder / ".reserve").write_bytes(b"0")
-    claim(folder)
+    for name in (".reserve", ".reserve.part", "run.json.part"):
+        (folder / name).write_bytes(b"0")
+    assert claim(folder) == folder
+    assert not (folder / "run.json.part").exists()
     (folder / "masks" / "0.1.png").write_bytes(b"of somebody")
     with pytest.raises(OutputError, match="other files"):
         claim(folder)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
+import logging
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 from mastd3r.camera.pinhole import Camera
 from mastd3r.errors import InputError, OutputError
 from mastd3r.export import files, machine
+from mastd3r.export.claim import settle
 from mastd3r.export.read_run import read_run
 from mastd3r.export.run_folder import RunFolder
 from mastd3r.types import StaticCloud, Trajectory
@@ -63,7 +66,7 @@ def test_a_whole_run_comes_back(tmp_path: Path) -> None:
     assert (run.mask_times_s().tolist(), run.render_times_s().tolist()) == ([0.1], [0.2])
     assert {p.name for p in folder.path.iterdir()} == {
         "run.json", "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "metrics.json",
-        "masks", "renders", "alpha", "depth",
+        "run.log", "masks", "renders", "alpha", "depth",
     }  # fmt: skip
 
 
@@ -77,19 +80,103 @@ def test_a_mask_value_above_127_is_more_likely_than_not(tmp_path: Path) -> None:
     assert np.abs(written / 255 - p).max() <= 0.5 / 255 + 1e-12
 
 
-def test_an_earlier_run_is_replaced_and_other_files_stay(tmp_path: Path) -> None:
-    first = RunFolder(tmp_path / "run")
+def earlier_run(path: Path) -> RunFolder:
+    first = RunFolder(path)
     first.write_trajectory(some_trajectory())
     first.write_mask(0.1, np.zeros((4, 4)))
+    first.write_mask(0.2, np.zeros((4, 4)))
     (first.path / "gaussians.ply").write_text("old")
     first.finish()
-    (first.path / "my notes.txt").write_text("keep me")
-    second = RunFolder(tmp_path / "run")
+    (path / "my notes.txt").write_text("keep me")
+    return first
+
+
+def test_an_earlier_run_stays_until_the_new_one_is_complete(tmp_path: Path) -> None:
+    first = earlier_run(tmp_path / "run")
+    before = {p: p.read_bytes() for p in first.path.rglob("*") if p.is_file()}
+    second = RunFolder(tmp_path / "run", ["mastd3r", "again"])
+    second.write_trajectory(some_trajectory())
+    second.write_mask(0.1, np.ones((4, 4)))
+    assert second.path == tmp_path / "run" / "unfinished"
+    assert {p: p.read_bytes() for p in before} == before
+    second.finish()
+    assert second.path == tmp_path / "run" and not (tmp_path / "run" / "unfinished").exists()
+    run = read_run(tmp_path / "run")
+    assert (run.record["status"], run.record["command"]) == ("complete", ["mastd3r", "again"])
+    assert run.mask_times_s().tolist() == [0.1] and run.mask(0.1).all()
+    assert not (second.path / "gaussians.ply").exists()
+    assert (second.path / "my notes.txt").read_text() == "keep me"
+
+
+def test_an_earlier_run_stays_when_the_new_one_is_stopped(tmp_path: Path) -> None:
+    earlier_run(tmp_path / "run")
+    with pytest.raises(KeyboardInterrupt) as stopped, RunFolder(tmp_path / "run") as second:
+        second.write_trajectory(some_trajectory())
+        raise KeyboardInterrupt
+    assert "unfinished" in stopped.value.__notes__[0]
+    assert (tmp_path / "run" / "gaussians.ply").read_text() == "old"
+    assert read_run(tmp_path / "run").record["status"] == "complete"
+    kept = read_run(tmp_path / "run" / "unfinished")
+    assert kept.record["status"] == "incomplete" and len(kept.trajectory.timestamps_s) == 5
+    third = RunFolder(tmp_path / "run")
+    assert third.path == tmp_path / "run" / "unfinished" and not (third.path / "trajectory.txt").exists()
+
+
+def test_overwriting_removes_an_earlier_run_at_once_and_other_files_stay(tmp_path: Path) -> None:
+    earlier_run(tmp_path / "run")
+    second = RunFolder(tmp_path / "run", overwrite=True)
+    assert second.path == tmp_path / "run"
     assert (second.path / "my notes.txt").read_text() == "keep me"
     assert not (second.path / "trajectory.txt").exists()
     assert not (second.path / "gaussians.ply").exists()
     assert not list((second.path / "masks").iterdir())
     assert json.loads((second.path / "run.json").read_text())["status"] == "running"
+
+
+@pytest.mark.parametrize("moves", [0, 1, 2, 4, 6, 8])
+def test_stopped_while_the_new_run_takes_its_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moves: int) -> None:
+    """After so many files, for good: whoever comes next finishes it."""
+    earlier_run(tmp_path / "run")
+    second = RunFolder(tmp_path / "run")
+    second.write_trajectory(some_trajectory())
+    second.write_mask(0.1, np.ones((4, 4)))
+    second.write_config("seed: 7")
+    left = [moves]
+
+    def replace_some(a: Path, b: Path) -> None:
+        if b.parent.name != "unfinished" and b.parent.parent.name != "unfinished":
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+        a.rename(b)
+
+    monkeypatch.setattr("mastd3r.export.claim.os.replace", replace_some)
+    with suppress(KeyboardInterrupt):
+        second.finish()
+    monkeypatch.undo()
+    settle(tmp_path / "run")
+    run = read_run(tmp_path / "run")
+    assert run.config == "seed: 7" and run.mask(0.1).all() and len(run.trajectory.timestamps_s) == 5
+    assert not (tmp_path / "run" / "gaussians.ply").exists() and not (tmp_path / "run" / "unfinished").exists()
+
+
+def test_an_unexpected_end_is_an_end_with_its_traceback_in_the_log(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError) as caught, RunFolder(tmp_path / "run", ["mastd3r", "run"]) as folder:
+        logging.getLogger("mastd3r.somewhere").error("said in between")
+        folder.note(str(1 / 0))
+    record = read_run_record(tmp_path / "run")
+    assert record["status"] == "incomplete" and record["reason"] == "unexpected ZeroDivisionError: division by zero"
+    text = (tmp_path / "run" / "run.log").read_text()
+    assert "said in between" in text and "Traceback" in text and "command: ['mastd3r', 'run']" in text
+    assert "run.log" in caught.value.__notes__[0]
+    assert not (tmp_path / "run" / ".reserve").exists()
+    logging.getLogger("mastd3r.somewhere").error("said later")
+    assert "said later" not in (tmp_path / "run" / "run.log").read_text()
+
+
+def read_run_record(path: Path) -> dict[str, Any]:
+    record: dict[str, Any] = json.loads((path / "run.json").read_text())
+    return record
 
 
 def test_other_peoples_folders_are_refused_untouched(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Every thread of the package: values in the making, items made ready ahead, work in two threads or in blocks.
 
-Results never depend on which thread was faster."""
+Results never depend on which thread was faster. And what a request to stop must not cut in two (``undivided``)."""
 
 from __future__ import annotations
 
@@ -205,3 +205,39 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+class _Stop:
+    """A request to stop that waits for the end of what must not be divided."""
+
+    inside = 0
+    waiting: BaseException | None = None
+
+
+def stop_with(error: BaseException) -> None:
+    """Raise ``error`` in the main thread, whose signal handler calls this: at once, or at the end of ``undivided``.
+
+    Who asks again while the first request waits is served at once.
+    """
+    if _Stop.inside and _Stop.waiting is None:
+        _Stop.waiting = error
+        return
+    _Stop.waiting = None
+    raise error
+
+
+@contextmanager
+def undivided() -> Iterator[None]:
+    """A request to stop that comes within the block is raised at its end, so that what it changes is left whole."""
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's alone
+        yield
+        return
+    _Stop.inside += 1
+    try:
+        yield
+    finally:
+        _Stop.inside -= 1
+        error = _Stop.waiting
+        if _Stop.inside == 0 and error is not None:
+            _Stop.waiting = None
+            raise error

@@ -21,3 +21,15 @@ class MissingPackage(SlamError):
 
 class OutputError(SlamError):
     """The run folder cannot be written (no space, no permission)."""
+
+
+def reason_of(error: BaseException) -> str:
+    """Why a run ended, in one line."""
+    said = " ".join(str(error).split())
+    if isinstance(error, SlamError):
+        return said
+    if isinstance(error, KeyboardInterrupt):
+        return said or "stopped by the user (Ctrl-C)"
+    if isinstance(error, MemoryError):
+        return f"out of memory: expected more to be free, got {said or 'no more'}; use a lower width or fewer frames"
+    return f"unexpected {type(error).__name__}{said and ': '}{said}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -42,6 +43,7 @@ def reconstruct(
     config: Config | None = None,
     *,
     maps: str | Path | None = None,
+    overwrite: bool = False,
     command: Sequence[str] = (),
     reporter: Reporter | None = None,
 ) -> Reconstruction:
@@ -49,20 +51,23 @@ def reconstruct(
 
     source: a video, a folder of images, a sequence of a dataset, or an iterable of (seconds, image (h, w, 3) uint8
     RGB). out: the run folder; by default a temporary one, which lives as long as the result. maps: folder of
-    P(movable) maps. command and reporter: what run.json and the terminal show.
-    Raises SlamError children; what was computed until then is in ``out``.
+    P(movable) maps. overwrite: an earlier run in ``out`` is removed at once, not when this one is complete; until then
+    files are in ``out``/unfinished. command and reporter: what run.json and the terminal show.
+    Raises SlamError children; what was computed until then is in the run folder, with run.log.
     """
     config, reporter = config or Config(), reporter or Silent()
     if not isinstance(source, str | Path):
-        return _of_images(source, out, config, command, reporter)
+        return _of_images(source, config, _Wanted(out, overwrite, command), reporter)
     slam, notes = _slam_of(source, config, maps)
-    folder, temporary = _folder(out, command, [Path(p).expanduser() for p in (source, maps) if p is not None])
-    job = slam.job(folder, reporter)
-    folder.update(source={**folder.record["source"], "path": str(Path(source).expanduser().resolve())})
-    folder.note(*notes)
-    with job:
-        _track(slam, job)
-        slam.finish(job)
+    inputs = [Path(p).expanduser() for p in (source, maps) if p is not None]
+    folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
+    with folder:
+        job = slam.job(folder, reporter)
+        folder.update(source={**folder.record["source"], "path": str(Path(source).expanduser().resolve())})
+        folder.note(*notes)
+        with job:
+            _track(slam, job)
+            slam.finish(job)
     return Reconstruction(folder.path, temporary)
 
 
@@ -103,14 +108,22 @@ def _slam_of(path: str | Path, config: Config, maps: str | Path | None) -> tuple
     return Slam(config, source.size, source=source), notes
 
 
-def _folder(
-    out: str | Path | None, command: Sequence[str], inputs: list[Path]
-) -> tuple[RunFolder, tempfile.TemporaryDirectory[str] | None]:
-    temporary = None
+@dataclass(frozen=True)
+class _Wanted:
+    """The run folder, as the caller wants it."""
+
+    out: str | Path | None
+    overwrite: bool
+    command: Sequence[str]
+
+
+def _folder(wanted: _Wanted, inputs: list[Path]) -> tuple[RunFolder, tempfile.TemporaryDirectory[str] | None]:
+    temporary, out = None, wanted.out
     if out is None:
         temporary = tempfile.TemporaryDirectory(prefix="mastd3r-run-", ignore_cleanup_errors=True)
         out = temporary.name
-    return RunFolder(Path(out).expanduser(), list(command), inputs), temporary
+    path = Path(out).expanduser()
+    return RunFolder(path, list(wanted.command), inputs, overwrite=wanted.overwrite), temporary
 
 
 def _track(slam: Slam, job: RunJob) -> None:
@@ -124,11 +137,7 @@ def _track(slam: Slam, job: RunJob) -> None:
 
 
 def _of_images(
-    images: Iterable[tuple[float, Array]],
-    out: str | Path | None,
-    config: Config,
-    command: Sequence[str],
-    reporter: Reporter,
+    images: Iterable[tuple[float, Array]], config: Config, wanted: _Wanted, reporter: Reporter
 ) -> Reconstruction:
     rest: Iterator[tuple[float, Array]] = iter(images)
     first = next(rest, None)
@@ -136,9 +145,8 @@ def _of_images(
         raise InputError("reconstruct: expected images, got none")
     height, width = np.shape(first[1])[:2] if np.ndim(first[1]) == 3 else (0, 0)
     slam = Slam(config, (width, height))
-    folder, temporary = _folder(out, command, [])
-    job = slam.job(folder, reporter)
-    with job:
+    folder, temporary = _folder(wanted, [])
+    with folder, slam.job(folder, reporter) as job:
         with job.timed("tracking"), job.reporter.stage("tracking", None, "frames") as bar:
             for time_s, image in chain([first], rest):
                 result = slam.track(image, time_s)

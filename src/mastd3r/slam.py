@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera.rectification import Rectifier, rectifier_for
-from .concurrency import Future, one_blas_thread
+from .concurrency import Future, one_blas_thread, undivided
 from .config import Config
 from .errors import InputError
 from .export.run_folder import RunFolder
@@ -115,7 +115,7 @@ class Slam:
         or does not rise, and after ``finish``.
         """
         frame = self._frame(image, timestamp_s, depth_m, semantic)
-        with self._measured():
+        with self._measured(), undivided():
             state = self.keyframes.up_to_date(self.state)
             seen = self.observer.observe(frame, None if state.anchor is None else state.anchor.work)  # (III-A)
             prior = self.masks.prior(seen)  # prior of (2): dynamics/filter.py
@@ -183,11 +183,12 @@ class Slam:
     def _finish_alone(self) -> Reconstruction:
         """``finish`` in a temporary folder."""
         folder = tempfile.TemporaryDirectory(prefix="mastd3r-run-", ignore_cleanup_errors=True)
-        job = self.job(RunFolder(Path(folder.name)))
-        job.already_tracked(self._tracked, self._tracking_s)
-        with job:
-            self.finish(job)
-        return Reconstruction(job.folder.path, folder)
+        with RunFolder(Path(folder.name)) as run:
+            job = self.job(run)
+            job.already_tracked(self._tracked, self._tracking_s)
+            with job:
+                self.finish(job)
+        return Reconstruction(run.path, folder)
 
     @contextmanager
     def _measured(self) -> Iterator[None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import argparse
 import os
 import shutil
@@ -14,10 +13,12 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ..config import Config, config_to_yaml
 from ..errors import ConfigError
 from .options import checked_minutes, config_from_args
+from .signals import end_this_command
 
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
@@ -28,7 +29,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.end_with_stdin:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
-    return _run_and_show(args.source, args.out, config, args.words, console, quiet=args.quiet, maps=args.maps)
+    return _run_and_show(args.source, config, args, console)
 
 
 def train_map(args: argparse.Namespace, console: Console) -> int:
@@ -42,7 +43,7 @@ def train_map(args: argparse.Namespace, console: Console) -> int:
     reporter = Silent() if args.quiet else Terminal(console)
     metrics = run.train_map(minutes, args.quality, source=args.source, reporter=reporter)
     Console().print(_table(metrics))
-    Console().print(f"Open [bold]{run.path / 'report.html'}[/bold]", soft_wrap=True)
+    _open(run.path)
     return 0
 
 
@@ -50,30 +51,34 @@ def _interrupt_when_stdin_closes() -> None:
     """Whoever started this run holds the other end: when that process is gone, this one ends as on Ctrl-C."""
     while os.read(0, 1024):
         pass
-    _thread.interrupt_main()
+    end_this_command()
 
 
-def _run_and_show(
-    source: Path,
-    out: Path,
-    config: Config,
-    words: list[str],
-    console: Console,
-    *,
-    quiet: bool = False,
-    maps: Path | None = None,
-) -> int:
+def _run_and_show(source: Path, config: Config, args: argparse.Namespace, console: Console) -> int:
+    """``args`` are those of ``run``, or of ``demo``, which has fewer."""
     from ..pipeline import reconstruct
     from ..progress import Silent
     from .terminal import Terminal
 
-    reporter = Silent() if quiet else Terminal(console)
-    result = reconstruct(source, out, config, maps=maps, command=words, reporter=reporter)
+    result = reconstruct(
+        source,
+        args.out,
+        config,
+        maps=getattr(args, "maps", None),
+        overwrite=args.overwrite,
+        command=args.words,
+        reporter=Silent() if getattr(args, "quiet", False) else Terminal(console),
+    )
     if result.observability.get("said"):
-        Console().print(f"[bold]{result.observability['said']}[/bold]", soft_wrap=True)
+        Console().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
     Console().print(_table(result.metrics))
-    Console().print(f"Open [bold]{result.path / 'report.html'}[/bold]", soft_wrap=True)
+    _open(result.path)
     return 0
+
+
+def _open(run: Path) -> None:
+    """Where to look now."""
+    Console().print("Open", Text(str(run / "report.html"), "bold"), soft_wrap=True)
 
 
 def _table(metrics: dict[str, Any]) -> Table:
@@ -98,7 +103,7 @@ def demo(args: argparse.Namespace, console: Console) -> int:
         config = replace(
             Config(), mapping=replace(Config().mapping, iterations=DEMO_STEPS, max_gaussians=DEMO_GAUSSIANS)
         )
-        code = _run_and_show(clip, args.out, config, args.words, console)
+        code = _run_and_show(clip, config, args, console)
         shutil.copy(clip / "rgb" / sorted(p.name for p in (clip / "rgb").iterdir())[0], args.out / "first_frame.png")
     return code
 
@@ -130,7 +135,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
     from ..pipeline import load
 
     written = load(args.run).export(args.to, args.out)
-    Console().print(f"wrote {written}", soft_wrap=True)
+    Console().print(f"wrote {written}", soft_wrap=True, markup=False)
     return 0
 
 
@@ -143,7 +148,7 @@ def view(args: argparse.Namespace, console: Console) -> int:
     report = load(args.run).path / "report.html"
     if not report.is_file():
         raise ConfigError(f"{report}: expected the report of a complete run, got none")
-    Console().print(f"opening {report}", soft_wrap=True)
+    Console().print(f"opening {report}", soft_wrap=True, markup=False)
     webbrowser.open(report.resolve().as_uri())
     return 0
 

@@ -15,12 +15,10 @@ def dispatch(words: list[str]) -> int:
     """Parse and run one command; returns the exit code."""
     args = parser().parse_args(words)
     console = Console(stderr=True)
-    logging.basicConfig(
-        level=_log_level(args),
-        format="%(message)s",
-        handlers=[RichHandler(console=console, show_path=False, show_time=False)],
-        force=True,
-    )
+    shown = _log_level(args)
+    terminal = RichHandler(shown, console=console, show_path=False, show_time=False)
+    logging.basicConfig(level=shown, format="%(message)s", handlers=[terminal], force=True)
+    logging.getLogger("mastd3r").setLevel(logging.INFO)  # for run.log; the terminal's own level stays
     args.words = ["mastd3r", *words]
     code: int = args.act(args, console)
     return code

@@ -6,30 +6,58 @@ import os
 import sys
 from collections.abc import Sequence
 
-EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_FAULT, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 KEPT = "what was computed so far is in the run folder"
 KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; 0 = done, 2 = something that the user can mend (one line says what), 130 = Ctrl-C."""
+    """Run a command; 0 = done, 2 = something that the user can mend (one line says what), 130 = told to stop.
+
+    1 = a fault of ours: one line, and the file that has its traceback.
+    """
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # waiting threads must not eat the cores
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the solvers' matrices are small: threads only wait
-    from ..errors import SlamError
+    from ..errors import SlamError, reason_of
     from .dispatch import dispatch
+    from .signals import stopping_signals
 
     words = list(sys.argv[1:] if argv is None else argv)
     try:
-        return dispatch(words)
-    except SlamError as e:
-        print(f"mastd3r: {e}", file=sys.stderr)
+        with stopping_signals():
+            return dispatch(words)
+    except (SlamError, MemoryError) as e:
+        say(reason_of(e), e)
         return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as e:
         command = next((w for w in words if not w.startswith("-")), "")
-        print(f"mastd3r: stopped; {KEPT_BY.get(command, KEPT)}", file=sys.stderr)
+        say(f"stopped; {KEPT_BY.get(command, KEPT)}", e)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 0
+    except Exception as e:  # noqa: BLE001  the boundary that nothing passes
+        say(reason_of(e), e if hasattr(e, "__notes__") else _kept(e))
+        return EXIT_FAULT
+
+
+def say(line: str, error: BaseException) -> None:
+    """The one line of a command that has not done its work, with what is known about ``error``."""
+    text = "; ".join([f"mastd3r: {line}", *getattr(error, "__notes__", ())])
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    print(shown, file=sys.stderr)
+
+
+def _kept(error: Exception) -> Exception:
+    """The same, with its traceback in a file that a note names: outside a run there is no run.log."""
+    import tempfile
+    import traceback
+
+    with tempfile.NamedTemporaryFile(
+        "w", prefix="mastd3r-", suffix=".log", delete=False, encoding="utf-8", errors="backslashreplace"
+    ) as file:
+        file.write("".join(traceback.format_exception(error)))
+    error.add_note(f"{file.name} holds the traceback: please report it with that file")
+    return error
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ QUALITY_HELP = (
     "image width, steps and number of Gaussians of the map, more on an accelerator than on the CPU "
     f"(default {Config().mapping.quality})"
 )
+OVERWRITE_HELP = "remove an earlier run in --out at once (default: it is replaced once the new one is complete)"
 MINUTES_HELP = "train the map for so long, instead of for the number of steps of its quality (the default)"
 
 
@@ -40,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
+    demo.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     export = known.add_parser("export", help="write a run's trajectory or splat in another format")
@@ -84,6 +86,7 @@ def _eval_parser(p: argparse.ArgumentParser) -> None:
 def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("source", type=Path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
     p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
     p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once; paper: everything as printed")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -174,7 +173,7 @@ def _stopped_at_the_end(running: list[Running]) -> Iterator[None]:
     finally:
         for r in running:
             with suppress(ProcessLookupError):
-                r.process.send_signal(signal.SIGINT)
+                r.process.terminate()
         end = time.monotonic() + END_S
         for r in running:
             try:

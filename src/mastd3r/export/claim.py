@@ -1,29 +1,39 @@
-"""Which folder a run may write in: an empty one, or an earlier run's. Nothing that is not ours is ever removed."""
+"""Which folder a run may write in: an empty one, or an earlier run's. Nothing that is not ours is ever removed.
+
+An earlier run is replaced only by a complete one, or where the user says so."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from ..errors import OutputError
 from .files import writing
 
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
+    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4", "run.log",
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")
-RESERVE = ".reserve"
-PICTURE = re.compile(r"-?\d+\.\d{6}\.png")  # as a run names them; other files of its folders are somebody else's
+RECORD_FILE, RESERVE = "run.json", ".reserve"
+UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
+MOVING = ".moving"  # in it: what the earlier one had more of is gone
+PICTURE = re.compile(r"-?\d+\.\d{6}\.png(\.part)?")  # as a run names them; others in its folders are not ours
 RECORD = {"status": str, "command": list, "machine": dict, "choices": list, "timings_s": dict}  # of our run.json
 ANOTHER = "choose another folder with --out"
 
 
-def claim(folder: Path, inputs: Sequence[Path] = ()) -> None:
-    """Make a folder ready for a run: it is made where it is missing, and an earlier run of ours is removed from it.
+def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False) -> Path:
+    """Make a folder ready for a run, and give the folder to write in.
 
+    An earlier run of ours that has poses stays as it is: the new one is written to ``unfinished`` within the folder,
+    and ``settle`` lets it take the place of the earlier one once it is complete. With ``overwrite``, and where there
+    is nothing worth keeping, what is left of an earlier run is removed and the folder itself is written in.
     ``inputs`` are what the run will read (the source, the user's maps). Raises OutputError, before anything is
     touched, for a folder that holds one of them or lies in one, that has files of unknown origin and no run of ours,
     or whose names of ours are symbolic links; and for whatever the system refuses.
@@ -32,18 +42,66 @@ def claim(folder: Path, inputs: Sequence[Path] = ()) -> None:
         _refuse_inputs(folder, inputs)
         folder.mkdir(parents=True, exist_ok=True)
         _refuse_links(folder)
+        unfinished = folder / UNFINISHED
+        if unfinished.is_dir():
+            _refuse_links(unfinished)
         if not _is_ours(folder):
             raise OutputError(
                 f"{folder}: expected an empty folder or an earlier run, got a folder with other files and no run.json "
                 f"of a run; {ANOTHER}"
             )
-        for name in FILES:
-            (folder / name).unlink(missing_ok=True)
+        settle(folder)
+        _remove_run(unfinished)
+        if (folder / "trajectory.txt").is_file() and not overwrite:
+            folder = unfinished
+        _remove_run(folder)
+        for name in FOLDERS:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        return folder
+
+
+def settle(folder: Path, *, also_incomplete: bool = False) -> None:
+    """Let the complete run in ``unfinished`` take the place of the one before; nothing where there is none.
+
+    Stopped anywhere in the middle, another call does the rest; run.json comes last. Raises OutputError.
+    """
+    new = folder / UNFINISHED
+    record = _record(new)
+    if record is None or not (also_incomplete or record["status"] == "complete"):
+        return
+    with writing(folder):
+        if not (new / MOVING).exists():  # from then on, what is missing there has been moved
+            for old in _files_of(folder):
+                if not (new / old.relative_to(folder)).is_file():
+                    old.unlink()
+            (new / MOVING).touch()
         for name in FOLDERS:
             (folder / name).mkdir(exist_ok=True)
-            for old in (folder / name).iterdir():
-                if PICTURE.fullmatch(old.name):
-                    old.unlink()
+        for file in _files_of(new):
+            os.replace(file, folder / file.relative_to(new))
+        os.replace(new / RECORD_FILE, folder / RECORD_FILE)
+        _remove_run(new)
+
+
+def _files_of(folder: Path) -> list[Path]:
+    """Of the run in a folder, all but run.json."""
+    pictures = [p for name in FOLDERS for p in _pictures(folder / name)]
+    return [path for name in FILES if (path := folder / name).is_file()] + pictures
+
+
+def _remove_run(folder: Path) -> None:
+    """Remove what a run writes, and the folder if that was all; files that no run writes stay."""
+    for file in _files_of(folder):
+        file.unlink()
+    for name in (RECORD_FILE, RESERVE, MOVING, *(f"{name}.part" for name in (*FILES, RECORD_FILE, RESERVE))):
+        (folder / name).unlink(missing_ok=True)
+    for path in (*(folder / name for name in FOLDERS), folder):
+        with suppress(OSError):
+            path.rmdir()
+
+
+def _pictures(folder: Path) -> list[Path]:
+    return [p for p in folder.iterdir() if PICTURE.fullmatch(p.name)] if folder.is_dir() else []
 
 
 def check_ours(folder: Path) -> None:
@@ -66,18 +124,30 @@ def _refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
 
 
 def _refuse_links(folder: Path) -> None:
-    for name in (*FILES, *FOLDERS, "run.json", RESERVE):
+    for name in (*FILES, *FOLDERS, RECORD_FILE, RESERVE, UNFINISHED):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: expected a file or folder of a run, got a symbolic link; {ANOTHER}")
 
 
 def _is_ours(folder: Path) -> bool:
     """True for nothing at all, for what a run leaves that was stopped at once, and for a run."""
-    entries = list(folder.iterdir())
-    if all(p.name == RESERVE or (p.name in FOLDERS and p.is_dir() and not any(p.iterdir())) for p in entries):
-        return True
-    try:
-        record = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+    unfinished = folder / UNFINISHED
+    if unfinished.is_dir() and not _is_ours(unfinished):
         return False
-    return isinstance(record, dict) and all(isinstance(record.get(k), kind) for k, kind in RECORD.items())
+    return all(_left_at_once(p) for p in folder.iterdir()) or _record(folder) is not None
+
+
+def _left_at_once(path: Path) -> bool:
+    if path.name in (*FOLDERS, UNFINISHED):
+        return path.is_dir() and (path.name == UNFINISHED or not any(path.iterdir()))
+    return path.name in (RESERVE, f"{RESERVE}.part", f"{RECORD_FILE}.part")
+
+
+def _record(folder: Path) -> dict[str, Any] | None:
+    """run.json, if it is one of ours."""
+    try:
+        record = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+    is_ours = isinstance(record, dict) and all(isinstance(record.get(k), kind) for k, kind in RECORD.items())
+    return record if is_ours else None

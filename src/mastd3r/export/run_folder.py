@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import cv2
@@ -15,12 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
-from ..errors import OutputError
+from ..concurrency import undivided
+from ..errors import OutputError, SlamError, reason_of
 from ..types import StaticCloud, Trajectory
-from .claim import RESERVE, claim
+from .claim import RESERVE, claim, settle
 from .files import write_bytes, write_json, write_text
 from .machine import machine_info
 from .point_cloud import write_cloud
+from .run_log import RunLog
 from .trajectory_files import write_tum
 
 Array = NDArray[Any]
@@ -33,16 +36,25 @@ def stamp(timestamp_s: float) -> str:
 
 
 class RunFolder:
-    """A folder that holds one run. ``run.json`` says "running" until ``finish``.
+    """A folder that holds one run. ``run.json`` says "running" until ``finish``; files that no run writes stay.
 
-    Files of an earlier run are removed first; files that no run writes are left alone. Raises OutputError as
-    ``claim`` does; ``inputs`` are the paths that the run reads.
+    ``path`` is where files are written now: another folder within the one that was asked for while an earlier run
+    stands there, and from ``finish`` of a complete run on the one that was asked for. As a context it writes what is
+    logged to ``run.log``, and whatever ends the block, the run has ended. Raises OutputError as ``claim`` does;
+    ``inputs`` are the paths that the run reads, ``overwrite`` removes an earlier run at once.
     """
 
-    def __init__(self, path: Path | str, command: Sequence[str] = (), inputs: Sequence[Path] = ()) -> None:
-        self.path = Path(path)
-        self._reserve = self.path / RESERVE
-        claim(self.path, inputs)
+    def __init__(
+        self,
+        path: Path | str,
+        command: Sequence[str] = (),
+        inputs: Sequence[Path] = (),
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        self.home = Path(path)
+        self.path = claim(self.home, inputs, overwrite=overwrite)
+        self.log = RunLog(self.path / "run.log")
         self.record: dict[str, Any] = {
             "status": "running",
             "reason": None,
@@ -53,15 +65,37 @@ class RunFolder:
             "choices": [],
             "timings_s": {},
         }
-        write_bytes(self._reserve, os.urandom(RESERVE_BYTES))
+        write_bytes(self.path / RESERVE, os.urandom(RESERVE_BYTES))
         self._save()
+        self.log.begin(self.record)
+        if self.path != self.home:
+            self.note(f"{self.home} holds an earlier run: it is replaced once this one is complete")
 
     @classmethod
     def again(cls, path: Path, record: dict[str, Any]) -> RunFolder:
         """A folder to write files of a run in that has ended: nothing is removed; ``record`` is its run.json."""
         folder = cls.__new__(cls)
-        folder.path, folder._reserve, folder.record = Path(path), Path(path) / RESERVE, record
+        folder.home = folder.path = Path(path)
+        folder.log, folder.record = RunLog(folder.path / "run.log"), record
         return folder
+
+    def __enter__(self) -> RunFolder:
+        self.log.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Whatever stops the run, run.json says so, and run.log holds where an unexpected error came from."""
+        with undivided():
+            if error is not None and self.record["status"] == "running":
+                with suppress(SlamError):
+                    self.finish("incomplete", reason_of(error))
+            if error is not None:
+                self.log.ended_by(error)
+                if self.path != self.home:
+                    error.add_note(f"it is {self.path}, the earlier run in {self.home} stays")
+            self.log.close()
 
     def update(self, **fields: Any) -> None:
         """Add fields to run.json, or replace them."""
@@ -74,16 +108,27 @@ class RunFolder:
         self._save()
 
     def finish(self, status: str = "complete", reason: str | None = None) -> None:
-        """Close the run: ``complete``, or ``incomplete`` with the reason in one line."""
+        """Close the run: ``complete``, or ``incomplete`` with the reason in one line.
+
+        A complete run takes the place of an earlier one. Nothing may be written afterwards.
+        """
         if status not in {"complete", "incomplete"} or (status == "incomplete") != bool(reason):
             raise ValueError(f"expected complete, or incomplete with a reason; got {status!r}, {reason!r}")
         self.make_room()
-        self.update(status=status, reason=reason, finished=_now())
+        self.update(**self.ending(status, reason))
+        if status == "complete" and self.path != self.home:
+            self.log.close()
+            settle(self.home)
+            self.path = self.home
+
+    def ending(self, status: str = "complete", reason: str | None = None) -> dict[str, Any]:
+        """What ``finish`` puts into run.json: for who tells of the end before it is there."""
+        return {"status": status, "reason": reason, "finished": self.record["finished"] or _now()}
 
     def make_room(self) -> None:
         """Give back the reserved space, for the last small files on a full disk."""
         with suppress(OSError):
-            self._reserve.unlink()
+            (self.path / RESERVE).unlink()
 
     def write_config(self, yaml_text: str) -> None:
         """config.yaml: the effective configuration."""

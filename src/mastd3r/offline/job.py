@@ -18,8 +18,9 @@ from ..camera.map_view import MapView
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
 from ..camera.rectification import Rectifier
+from ..concurrency import undivided
 from ..config import Config, config_to_yaml
-from ..errors import InputError, SlamError
+from ..errors import InputError, SlamError, reason_of
 from ..evaluation.evaluate import evaluate
 from ..export.evidence import EvidenceSample
 from ..export.machine import peak_rss_mib
@@ -241,8 +242,9 @@ class RunJob:
         if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
             self.folder.write_aligned(aligned)
         self.folder.update(timings_s=self.timings)
+        record = self.folder.record | self.folder.ending()
+        write_run_report(self.folder.path, self.source, evaluation, self._evidence, record)
         self.folder.finish()
-        write_run_report(self.folder.path, self.source, evaluation, self._evidence)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -250,6 +252,7 @@ class RunJob:
         began = time.perf_counter()
         try:
             yield
+            log.info("%s: %.1f s", stage, time.perf_counter() - began)
         finally:
             self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - began
             self.folder.record["timings_s"] = self.timings
@@ -342,12 +345,11 @@ class RunJob:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if isinstance(error, SlamError):
-            self.save_the_rest(str(error))
-        elif isinstance(error, KeyboardInterrupt):
-            self.save_the_rest("stopped by the user (Ctrl-C)")
-        if self._live is not None:
-            self._live.close()
+        with undivided():
+            if self._live is not None:
+                self._live.close()
+            if error is not None and self.folder.record["status"] == "running":
+                self.save_the_rest(reason_of(error))
 
     def save_the_rest(self, reason: str) -> None:
         """Write what is known and mark the run incomplete; never hides the error that brought us here."""
@@ -362,6 +364,9 @@ class RunJob:
                 self._write_trajectory()
             self.folder.note(*self.source.notes)
             self.folder.update(timings_s=self.timings)
+        except Exception as e:  # noqa: BLE001  whatever state the first error left
+            log.error("could not save everything: %s", reason_of(e))
+        try:
             self.folder.finish("incomplete", reason)
         except SlamError as e:
             log.error("could not save everything: %s", e)

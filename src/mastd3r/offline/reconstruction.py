@@ -19,7 +19,7 @@ from ..concurrency import one_blas_thread
 from ..config import Config, MapQualityKind, config_from_dict
 from ..errors import ConfigError, InputError
 from ..evaluation.evaluate import evaluate
-from ..export.claim import claim
+from ..export.claim import claim, settle
 from ..export.files import write_json, writing
 from ..export.formats import export_run
 from ..export.point_cloud import read_cloud
@@ -212,13 +212,17 @@ class Reconstruction:
         return path
 
     def save(self, path: str | Path) -> Path:
-        """Copy the run folder to ``path``, and stay there. Raises OutputError where that is not ours to write."""
+        """Copy the run folder to ``path``, and stay there; a run that was there is replaced once the copy is whole.
+
+        Raises OutputError where that is not ours to write.
+        """
         target = Path(path).expanduser()
         if target.resolve() == self.path.resolve():
             return self.path
-        claim(target, [self.path])
+        where = claim(target, [self.path])
         with writing(target):
-            shutil.copytree(self.path, target, dirs_exist_ok=True)
+            shutil.copytree(self.path, where, dirs_exist_ok=True)
+        settle(target, also_incomplete=True)
         self._run, self._temporary = read_run(target), None
         return target
 

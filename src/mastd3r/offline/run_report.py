@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from ..evaluation.evaluate import Evaluation
 from ..export.evidence import EvidenceSample
+from ..export.files import plain
 from ..export.read_run import read_run
 from ..export.report import write_report
 from ..export.report_data import gather_report_data
@@ -13,13 +16,19 @@ from ..types import Source
 
 
 def write_run_report(
-    path: Path, source: Source, evaluation: Evaluation, evidence: EvidenceSample | None = None
+    path: Path,
+    source: Source,
+    evaluation: Evaluation,
+    evidence: EvidenceSample | None = None,
+    record: dict[str, Any] | None = None,
 ) -> None:
     """Write the report of the run folder ``path``; ``evidence`` of one frame is shown where it is given.
 
-    Raises InputError for files of the run that cannot be read, OutputError.
+    ``record`` stands for run.json of a run that is about to end. Raises InputError for files of the
+    run that cannot be read, OutputError.
     """
     run, ate = read_run(path), evaluation.ate
+    run = run if record is None else replace(run, record=plain(record))
     known = ate if ate is not None and ate.rmse is not None else None
     data = gather_report_data(
         run,
