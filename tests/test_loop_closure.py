@@ -270,16 +270,36 @@ def test_a_camera_does_not_turn_round_from_one_frame_to_the_next(scene: Any) -> 
     assert plausible_turn(graph, index, seen(2.5, 2))  # no poses yet, nothing to tell
 
 
-@pytest.mark.parametrize(("turn", "sure", "found"), [(0.1, False, True), (2.5, False, False), (2.5, True, True)])
-def test_a_lost_frame_is_not_found_where_the_camera_cannot_be(scene: Any, turn: float, sure: bool, found: bool) -> None:
+@pytest.mark.parametrize(
+    ("turn", "sure", "walked", "found"),
+    [
+        (0.1, False, None, True),
+        (2.5, False, 0.0, False),
+        (2.5, True, 0.0, True),  # another keyframe sees the frame at the same place
+        (2.5, True, 0.5, False),  # what both see has walked on in between
+        (2.5, True, None, False),  # no other keyframe sees it
+    ],
+)
+def test_a_lost_frame_is_not_found_where_the_camera_cannot_be(
+    scene: Any, turn: float, sure: bool, walked: float | None, found: bool
+) -> None:
     graph, _ = drifted(scene)
     pose = graph.records[-1].cam_from_kf @ graph.variables[VIEWS - 1].cam_from_world
-    new_from_ref = se3_exp(np.array([0, 0, 0, 0, turn, 0])) @ pose @ inverse(graph.variables[2].cam_from_world)
-    view = SimpleNamespace(anchor=graph.keyframes[2], alignment=SimpleNamespace(new_from_ref=new_from_ref))
-    eyes: Any = SimpleNamespace(relocalised=lambda *_: view, beyond_doubt=lambda *_: sure)
+    depth = 1 / float(np.median(graph.variables[2].inv_depth))
+
+    def seen(kf: Any, *_: Any) -> Any:
+        if kf.id != 2 and walked is None:
+            return None
+        there = se3_exp(np.array([0, 0, 0, 0, turn, 0])) @ pose @ inverse(graph.variables[kf.id].cam_from_world)
+        if kf.id != 2:
+            there[0, 3] += (walked or 0.0) * depth
+        return SimpleNamespace(anchor=kf, alignment=SimpleNamespace(new_from_ref=there))
+
+    eyes: Any = SimpleNamespace(graph=graph, relocalised=seen, beyond_doubt=lambda *_: sure)
     recovery = Recovery(None, graph, eyes, None)  # type: ignore[arg-type]
     work: Any = SimpleNamespace(index=VIEWS)
-    assert (recovery._relocalised([graph.keyframes[2]], work, Future.done(np.zeros(1))) is view) == found
+    view = recovery._relocalised([graph.keyframes[2]], work, Future.done(np.zeros(1)))
+    assert (view is not None and view.anchor.id == 2) == found
 
 
 def test_pieces_are_not_joined_by_a_view_in_doubt(scene: Any) -> None:

@@ -11,7 +11,7 @@ from ..concurrency import Future
 from ..graph.keyframe_graph import FrameRecord, Keyframe, KeyframeGraph
 from ..types import USABLE_WEIGHT, Frame, WorkFrame
 from .observation import Observer
-from .places import most_alike, plausible_turn
+from .places import believed, most_alike
 from .two_view import TwoView, TwoViewEstimator
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ def find_lost(frames: Iterator[Frame], graph: KeyframeGraph, observer: Observer,
         seen = None if record is None else observer.observe(frame)
         if record is None or seen is None or seen.blank:
             continue
-        view = _seen_from(_candidates(record, known, graph, two_view, seen.work), seen.work, graph, two_view)
+        view = _seen_from(_candidates(record, known, graph, two_view, seen.work), seen.work, two_view)
         if view is not None:
             graph.place(record, view.anchor.id, view.alignment.new_from_ref, view.pair.matches, view.weight)
             found += 1
@@ -63,9 +63,7 @@ def _candidates(
     return [*near, *most_alike(two_view.parts, graph, work, others, ALIKE)]
 
 
-def _seen_from(
-    candidates: list[Keyframe], work: WorkFrame, graph: KeyframeGraph, two_view: TwoViewEstimator
-) -> TwoView | None:
+def _seen_from(candidates: list[Keyframe], work: WorkFrame, two_view: TwoViewEstimator) -> TwoView | None:
     """The frame from the first keyframe that sees it beyond doubt."""
     moving = np.zeros(work.gray.shape, np.float32) if work.semantic is None else work.semantic
     prior = Future.done(moving)
@@ -74,7 +72,7 @@ def _seen_from(
         if view is None:
             continue
         enough = (view.weight > USABLE_WEIGHT).sum() >= MIN_MATCHES
-        believed = plausible_turn(graph, work.index, view) or two_view.beyond_doubt(view, work, prior)
-        if enough and believed and view.alignment.inlier_ratio >= MIN_INLIERS:
+        sure = enough and view.alignment.inlier_ratio >= MIN_INLIERS
+        if sure and believed(two_view, work, view, prior):
             return view
     return None

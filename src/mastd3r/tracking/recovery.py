@@ -15,7 +15,7 @@ from ..parts import Parts
 from ..types import WorkFrame
 from .keyframes import Keyframes
 from .observation import Observation
-from .places import candidates, plausible_turn
+from .places import believed, candidates
 from .state import Status, TrackingState, status_in
 from .two_view import THIN, TwoView, TwoViewEstimator, matched_share
 
@@ -100,14 +100,10 @@ class Recovery:
         """The frame seen from the first of these keyframes that sees it."""
         for kf in candidates:
             view = self.two_view.relocalised(kf, work, prior)
-            if view is not None and self._believed(view, work, prior):
+            if view is not None and believed(self.two_view, work, view, prior):
                 log.info("frame %d found again from keyframe %d", work.index, kf.id)
                 return view
         return None
-
-    def _believed(self, view: TwoView, work: WorkFrame, prior: Future[Array]) -> bool:
-        """A camera does not turn at will from one frame to the next: a view that says so must be beyond doubt."""
-        return plausible_turn(self.graph, work.index, view) or self.two_view.beyond_doubt(view, work, prior)
 
     def _start_again(self, state: TrackingState, work: WorkFrame, prior: Future[Array]) -> TrackingState:
         """The camera is lost: what follows is a submap of its own until it is recognised."""
