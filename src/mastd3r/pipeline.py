@@ -6,7 +6,7 @@ import logging
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .concurrency import one_blas_thread
-from .config import Config
+from .config import Config, config_from_yaml, config_to_yaml
 from .errors import InputError
 from .evaluation.evaluate import evaluate_trajectory as score
+from .export.claim import CHECKPOINT, stopped_run
+from .export.read_run import read_json
 from .export.run_folder import RunFolder
 from .export.trajectory_files import read_trajectory
 from .offline.job import MapMaterial, RunJob
@@ -58,17 +60,81 @@ def reconstruct(
     config, reporter = config or Config(), reporter or Silent()
     if not isinstance(source, str | Path):
         return _of_images(source, config, _Wanted(out, overwrite, command), reporter)
+    read = {"path": _absolute(source), "maps": None if maps is None else _absolute(maps)}
     slam, notes = _slam_of(source, config, maps)
+    stopped = None if out is None or overwrite else _stopped_as(Path(out).expanduser(), slam, read)
+    if stopped is not None:
+        return _go_on(slam, stopped, reporter)
     inputs = [Path(p).expanduser() for p in (source, maps) if p is not None]
     folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
     with folder:
-        job = slam.job(folder, reporter)
-        folder.update(source={**folder.record["source"], "path": str(Path(source).expanduser().resolve())})
+        folder.update(source=read)
+        job = slam.job(folder, reporter, checkpoints=temporary is None)
         folder.note(*notes)
         with job:
             _track(slam, job)
             slam.finish(job)
     return Reconstruction(folder.path, temporary)
+
+
+@one_blas_thread()
+def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstruction:
+    """Go on with a run that was stopped, as ``mastd3r resume``: from its last good checkpoint, else from the start.
+
+    The trajectory is that of a run that was never stopped. Raises InputError for a folder that holds no such run, or
+    whose source is gone; otherwise as ``reconstruct``.
+    """
+    path = Path(run).expanduser()
+    stopped = stopped_run(path)
+    if stopped is None:
+        raise InputError(f"{path}: expected a run that was stopped, got {_what_is_in(path)}")
+    read = read_json(stopped / "run.json").get("source") or {}
+    if not (stopped / "config.yaml").is_file() or not read.get("path"):
+        raise InputError(f"{stopped}: expected config.yaml and source.path in run.json, got a run stopped before them")
+    slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"))
+    return _go_on(slam, stopped, reporter or Silent())
+
+
+def _what_is_in(path: Path) -> str:
+    if not path.is_dir():
+        return "no such folder"
+    return "a complete one" if (path / "run.json").is_file() else "a folder without run.json of a run"
+
+
+def _absolute(path: str | Path) -> str:
+    return str(Path(path).expanduser().resolve())
+
+
+def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
+    """The stopped run in ``out``, if it has checkpoints and read the same with the same options."""
+    stopped = stopped_run(out) if out.is_dir() else None
+    if stopped is None or not (stopped / CHECKPOINT).is_dir():
+        return None
+    record = read_json(stopped / "run.json")
+    was = record.get("source") or {}
+    config = stopped / "config.yaml"
+    same = config.is_file() and config.read_text(encoding="utf-8") == config_to_yaml(slam.config)
+    return stopped if same and all(was.get(k) == v for k, v in read.items()) else None
+
+
+def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
+    """A stopped run, from its last good checkpoint."""
+    with RunFolder.going_on(stopped, read_json(stopped / "run.json")) as folder:
+        job = slam.job(folder, reporter, checkpoints=True)
+        with job:
+            memory = None if job.checkpoints is None else job.checkpoints.load()
+            if memory is None:
+                folder.note("resumed, but there is no good checkpoint: from the first frame")
+                done = None
+            else:
+                at = f"frame {memory.job.frames}" if memory.stage == "tracking" else f"the end of: {memory.stage}"
+                folder.note(f"resumed from the checkpoint at {at}")
+                log.warning(folder.record["choices"][-1])
+                done = slam.go_on(memory, job)
+            if done is None:
+                _track(slam, job, job.frames)
+                slam.finish(job)
+    return Reconstruction(folder.path)
 
 
 def evaluate_trajectory(path: str | Path, kind: str, sequence: str | Path) -> dict[str, Any]:
@@ -126,13 +192,16 @@ def _folder(wanted: _Wanted, inputs: list[Path]) -> tuple[RunFolder, tempfile.Te
     return RunFolder(path, list(wanted.command), inputs, overwrite=wanted.overwrite), temporary
 
 
-def _track(slam: Slam, job: RunJob) -> None:
-    """All frames of the source, in order."""
+def _track(slam: Slam, job: RunJob, known: int = 0) -> None:
+    """All frames of the source after the first ``known``, in order."""
     source: Source = slam.source
+    frames = islice(source.frames(), known, None)
     with job.timed("tracking"), job.reporter.stage("tracking", source.length, "frames") as bar:
-        for frame in slam.prefetched(source.frames()):
+        bar.advance(known)
+        for frame in slam.prefetched(frames):
             slam.track(frame)
             job.after(frame)
+            job.keep("tracking", slam.memory)
             bar.advance()
 
 

@@ -90,7 +90,11 @@ class Aligner(Protocol):
 
 
 class DynamicsFilter(Protocol):
-    """The mask while the video is read: it knows the frames before. Frames come in order."""
+    """The mask while the video is read: it knows the frames before. Frames come in order.
+
+    A run can be resumed where the filter also has ``memory()``, plain data that it carries to the next frame, and
+    ``remember(memory)``; see ``dynamics.filter``.
+    """
 
     appearance: Any  # what it learned of the appearance of moving things, for the smoother; None: nothing
 

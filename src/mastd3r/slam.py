@@ -24,6 +24,7 @@ from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.passages import retake_passages
+from .offline.checkpoints import Checkpoints, Memory
 from .offline.job import RunJob, Tracked
 from .offline.reconstruction import Reconstruction
 from .parts import Parts, build_parts, chosen_map_device, with_map_effort
@@ -34,6 +35,7 @@ from .tracking.keyframes import Keyframes
 from .tracking.loop_closure import add_covisible_pairs, close_loops
 from .tracking.lost_frames import find_lost
 from .tracking.masking import MaskTracker
+from .tracking.memory import TrackingMemory, can_remember, memory_of, remember
 from .tracking.observation import Near, Observer
 from .tracking.recovery import Recovery
 from .tracking.state import Status, TrackingState
@@ -144,8 +146,14 @@ class Slam:
             return self._finish_alone()
         with job.timed("tracking"):
             self.end_tracking()
+        job.keep("tracked", self.memory)
+        return self._after_tracking(job)
+
+    def _after_tracking(self, job: RunJob, *, solved: bool = False) -> Reconstruction:
         job.check_tracked()
-        job.solve()  # joint optimisation: graph/bundle_adjustment.py; every frame's pose: offline/final_solve.py
+        if not solved:
+            job.solve()  # joint optimisation: graph/bundle_adjustment.py; every frame's pose: offline/final_solve.py
+            job.keep("solved", self.memory)
         material = job.smooth_masks(self.masks.filter.appearance)  # III-A, forward-backward: dynamics/smoother.py;
         # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
         job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
@@ -153,6 +161,23 @@ class Slam:
         if self.recorded is not None:
             self.recorded.close()
         return Reconstruction(job.folder.path)
+
+    # -- a run that goes on from a checkpoint ----------------------------------------------------------------
+
+    def memory(self) -> TrackingMemory:
+        """All that tracking remembers now: to be written at once, nothing is copied."""
+        return memory_of(self.state, self.keyframes, self.masks, self.parts)
+
+    def go_on(self, memory: Memory, job: RunJob) -> Reconstruction | None:
+        """Stand where the run stood that gave ``memory``; what came of it where only later stages were missing."""
+        self.state = remember(memory.tracking, self.keyframes, self.masks, self.parts)
+        job.go_on(memory.job)
+        if memory.stage == "tracking":
+            return None
+        self._ended = True
+        self.masks.close()
+        self.keyframes.close()
+        return self._after_tracking(job, solved=memory.stage == "solved")
 
     def end_tracking(self) -> None:
         """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched."""
@@ -175,10 +200,13 @@ class Slam:
         frames = photographs if rectifier is None else (rectified(p, rectifier) for p in photographs)
         return self.observer.prefetched(frames, self._near)
 
-    def job(self, folder: RunFolder, reporter: Reporter | None = None) -> RunJob:
-        """What writes this run into a folder."""
+    def job(self, folder: RunFolder, reporter: Reporter | None = None, *, checkpoints: bool = False) -> RunJob:
+        """What writes this run into a folder; with checkpoints, if the frames can be read again."""
         tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, self.map_device)
-        return RunJob(tracked, folder, reporter or Silent())
+        if checkpoints and not can_remember(self.masks):
+            folder.note("no checkpoints: the filter of the mask does not say what it remembers")
+            checkpoints = False
+        return RunJob(tracked, folder, reporter or Silent(), Checkpoints(folder.path) if checkpoints else None)
 
     def _finish_alone(self) -> Reconstruction:
         """``finish`` in a temporary folder."""

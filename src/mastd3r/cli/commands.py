@@ -9,7 +9,7 @@ import tempfile
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.table import Table
@@ -19,6 +19,9 @@ from ..config import Config, config_to_yaml
 from ..errors import ConfigError
 from .options import checked_minutes, config_from_args
 from .signals import end_this_command
+
+if TYPE_CHECKING:
+    from ..offline.reconstruction import Reconstruction
 
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
@@ -30,6 +33,16 @@ def run(args: argparse.Namespace, console: Console) -> int:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
     return _run_and_show(args.source, config, args, console)
+
+
+def resume(args: argparse.Namespace, console: Console) -> int:
+    """``mastd3r resume``."""
+    from ..pipeline import resume as go_on
+    from ..progress import Silent
+    from .terminal import Terminal
+
+    _show(go_on(args.run, reporter=Silent() if args.quiet else Terminal(console)))
+    return 0
 
 
 def train_map(args: argparse.Namespace, console: Console) -> int:
@@ -69,11 +82,16 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
         command=args.words,
         reporter=Silent() if getattr(args, "quiet", False) else Terminal(console),
     )
+    _show(result)
+    return 0
+
+
+def _show(result: Reconstruction) -> None:
+    """What came of a run."""
     if result.observability.get("said"):
         Console().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
     Console().print(_table(result.metrics))
     _open(result.path)
-    return 0
 
 
 def _open(run: Path) -> None:

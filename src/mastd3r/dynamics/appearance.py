@@ -37,6 +37,15 @@ class AppearanceClassifier:
         self._info = np.zeros((0, 0))
         self._moving_samples = 0.0  # samples that moved
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Plain data."""
+        return {**vars(self), "_rng": self._rng.bit_generator.state}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._rng = np.random.default_rng()
+        self._rng.bit_generator.state = state["_rng"]
+
     def copy(self) -> AppearanceClassifier:
         """What it knows now; either may learn on without the other."""
         return deepcopy(self)

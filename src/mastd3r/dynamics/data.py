@@ -51,3 +51,13 @@ def check_input(frame: DynamicsInput, width: int, height: int) -> None:
     for name in ("gray", "inv_depth", "inv_depth_sigma", "own_inv_depth"):
         if getattr(frame, name) is not None:
             check_image(getattr(frame, name), name, width, height)
+
+
+class WithoutMemory:
+    """Of a filter that knows one frame alone: a run that goes on from a checkpoint has nothing to tell it."""
+
+    def memory(self) -> None:
+        """Nothing."""
+
+    def remember(self, memory: None) -> None:
+        """Nothing."""

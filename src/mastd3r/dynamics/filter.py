@@ -33,6 +33,16 @@ class _Arrival:
     appearance: Array | None  # (h', w') float32 log-odds of the classifier
 
 
+@dataclass(frozen=True)
+class FilterMemory:
+    """What the filter carries from frame to frame."""
+
+    past: tuple[Past, ...]
+    log_odds: Array | None
+    arrival: _Arrival | None
+    appearance: AppearanceClassifier
+
+
 class LogOddsFilter:
     """The log-odds filter, the one owner of the mask's memory. Deterministic; frames come in order, of one size."""
 
@@ -78,6 +88,15 @@ class LogOddsFilter:
         self._past.append(Past(arrival.gray, frame.world_from_cam.copy(), self.refinement.shrink(mask.probability)))
         self._log_odds, self._arrival = log_odds, None
         return mask
+
+    def memory(self) -> FilterMemory:
+        """What is carried on to the next frame; nothing is copied."""
+        return FilterMemory(tuple(self._past), self._log_odds, self._arrival, self.appearance)
+
+    def remember(self, memory: FilterMemory) -> None:
+        """Go on from what ``memory`` gave."""
+        self._past.extend(memory.past)
+        self._log_odds, self._arrival, self.appearance = memory.log_odds, memory.arrival, memory.appearance
 
     def _evidence(self, frame: DynamicsInput, arrival: _Arrival) -> tuple[Array, Array, dict[str, Array]]:
         """(log ratios of this frame alone, log-odds carried over, every term by name), half size."""

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import DynamicsConfig
-from .data import DynamicMask, DynamicsInput, check_image, check_input
+from .data import DynamicMask, DynamicsInput, WithoutMemory, check_image, check_input
 
 Array = NDArray[Any]
 T = TypeVar("T")
 
 
-class NothingMoves:
+class NothingMoves(WithoutMemory):
     """Filter and smoother at once; it has no memory."""
 
     appearance = None

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .config import DynamicsConfig
-from .data import DynamicMask, DynamicsInput, check_image, check_input
+from .data import DynamicMask, DynamicsInput, WithoutMemory, check_image, check_input
 from .refinement import EdgeRefinement, sigmoid
 
 Array = NDArray[Any]
@@ -76,7 +76,7 @@ def depth_likelihoods(depth: Array) -> tuple[Array, Array]:
     return np.where(valid, 1 / span, even), np.where(valid, np.maximum(static, 1e-12), even)
 
 
-class PaperMask:
+class PaperMask(WithoutMemory):
     """Filter and smoother at once: eq. (1)-(4) know one frame alone."""
 
     appearance = None

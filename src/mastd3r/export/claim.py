@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import OutputError
+from .checkpoint import remove_checkpoints
 from .files import writing
 
 FILES = (
@@ -21,6 +22,7 @@ FILES = (
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")
 RECORD_FILE, RESERVE = "run.json", ".reserve"
+CHECKPOINT = "checkpoint"  # folder of a run that goes on, or was stopped
 UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
 MOVING = ".moving"  # in it: what the earlier one had more of is gone
 PICTURE = re.compile(r"-?\d+\.\d{6}\.png(\.part)?")  # as a run names them; others in its folders are not ours
@@ -93,6 +95,7 @@ def _remove_run(folder: Path) -> None:
     """Remove what a run writes, and the folder if that was all; files that no run writes stay."""
     for file in _files_of(folder):
         file.unlink()
+    remove_checkpoints(folder / CHECKPOINT)
     for name in (RECORD_FILE, RESERVE, MOVING, *(f"{name}.part" for name in (*FILES, RECORD_FILE, RESERVE))):
         (folder / name).unlink(missing_ok=True)
     for path in (*(folder / name for name in FOLDERS), folder):
@@ -102,6 +105,15 @@ def _remove_run(folder: Path) -> None:
 
 def _pictures(folder: Path) -> list[Path]:
     return [p for p in folder.iterdir() if PICTURE.fullmatch(p.name)] if folder.is_dir() else []
+
+
+def stopped_run(folder: Path) -> Path | None:
+    """Where the run is that was last begun in a folder, and has not been completed; None where there is none."""
+    for path in (folder / UNFINISHED, folder):
+        record = _record(path)
+        if record is not None:
+            return None if record["status"] == "complete" else path
+    return None
 
 
 def check_ours(folder: Path) -> None:
@@ -124,7 +136,7 @@ def _refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
 
 
 def _refuse_links(folder: Path) -> None:
-    for name in (*FILES, *FOLDERS, RECORD_FILE, RESERVE, UNFINISHED):
+    for name in (*FILES, *FOLDERS, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: expected a file or folder of a run, got a symbolic link; {ANOTHER}")
 

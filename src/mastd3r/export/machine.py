@@ -30,6 +30,11 @@ def machine_info() -> dict[str, Any]:
     }
 
 
+def program() -> str:
+    """Version and commit: what another one has written down may mean something else."""
+    return f"{__version__} {git_commit(Path(__file__).parent) or ''}".strip()
+
+
 def usable_cores() -> int:
     """Cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):

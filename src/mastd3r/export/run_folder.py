@@ -19,8 +19,8 @@ from ..camera.pinhole import Camera
 from ..concurrency import undivided
 from ..errors import OutputError, SlamError, reason_of
 from ..types import StaticCloud, Trajectory
-from .claim import RESERVE, claim, settle
-from .files import write_bytes, write_json, write_text
+from .claim import FOLDERS, RESERVE, UNFINISHED, check_ours, claim, settle
+from .files import write_bytes, write_json, write_text, writing
 from .machine import machine_info
 from .point_cloud import write_cloud
 from .run_log import RunLog
@@ -77,6 +77,19 @@ class RunFolder:
         folder = cls.__new__(cls)
         folder.home = folder.path = Path(path)
         folder.log, folder.record = RunLog(folder.path / "run.log"), record
+        return folder
+
+    @classmethod
+    def going_on(cls, path: Path, record: dict[str, Any]) -> RunFolder:
+        """The folder of a run that was stopped, and is running again. Raises OutputError."""
+        check_ours(path)
+        folder = cls.again(path, record)
+        folder.home = path.parent if path.name == UNFINISHED else path
+        for name in FOLDERS:
+            with writing(path):
+                (path / name).mkdir(exist_ok=True)
+        write_bytes(path / RESERVE, os.urandom(RESERVE_BYTES))
+        folder.update(status="running", reason=None, finished=None)
         return folder
 
     def __enter__(self) -> RunFolder:

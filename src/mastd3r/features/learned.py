@@ -5,13 +5,14 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..concurrency import one_torch_thread
-from ..types import FeatureMatches
+from ..types import FeatureMatches, WorkFrame
 from .verification import is_static, of_one_geometry
 
 Array = NDArray[Any]
@@ -37,6 +38,14 @@ class MatchNetwork(Protocol):
     ) -> tuple[Array, Array]:
         """(m, 2) rows and (m,) probability; of pixels, descriptors, and the size (width, height) of both images."""
         ...
+
+
+@dataclass(frozen=True)
+class FeatureMemory:
+    """Whether the networks were read, and what is known of pairs of frames."""
+
+    asked: bool
+    pairs: tuple[tuple[WorkFrame, WorkFrame, tuple[Array, Array, Array]], ...]
 
 
 class LearnedFeatures:
@@ -71,6 +80,21 @@ class LearnedFeatures:
         with self._one_at_a_time, one_torch_thread():
             described = [self._described(a)[1][:FEATURES_OF_A_PLACE] for a in (image, *others)]
         return np.array([_common(described[0], d) for d in described[1:]])
+
+    def memory(self, frames: Sequence[WorkFrame]) -> FeatureMemory:
+        """What later answers depend on; of pairs those of ``frames``, the only ones that can be asked for again."""
+        by_image = {id(f.gray): f for f in frames}
+        with self._one_at_a_time:
+            pairs = [(by_image.get(a), by_image.get(b), found) for (a, b), (_, found) in self._pairs.items()]
+        known = tuple((a, b, found) for a, b, found in pairs if a is not None and b is not None)
+        return FeatureMemory(self._networks is not None, known)
+
+    def remember(self, memory: FeatureMemory) -> None:
+        """Answer as the one that gave ``memory`` would."""
+        if memory.asked:
+            self._networks_loaded()
+        for a, b, found in memory.pairs:
+            self._pairs[id(a.gray), id(b.gray)] = ((a.gray, b.gray), found)
 
     def _networks_loaded(self) -> tuple[FeatureNetwork, MatchNetwork]:
         if self._networks is None:

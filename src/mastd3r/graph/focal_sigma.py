@@ -61,3 +61,14 @@ def residual_sigma_px(graph: KeyframeGraph, kernel_px: float) -> float:
         u = e.weight / (1 + r2 / kernel_px**2)
         squares, weights = squares + float((u**2 * r2).sum()), weights + float(u.sum())
     return float(np.sqrt(squares / max(2 * weights, 1e-12)))
+
+
+def focal_facts(graph: KeyframeGraph, *, given: bool) -> dict[str, Any]:
+    """Where the focal length comes from, and its relative 1-sigma; None where it is ``given``."""
+    if given:
+        return {"found": "given", "focal_sigma_ratio": None}
+    known = focal_knowledge(graph)
+    assumed = known is None or known.assumed
+    start = "EXIF" if graph.intrinsics.focal_source == "EXIF" else "assumed"
+    sigma_ratio = PRIOR_FOCAL_SIGMA if known is None else known.sigma_ratio
+    return {"found": start if assumed else "from the video", "focal_sigma_ratio": sigma_ratio}

@@ -249,6 +249,10 @@ class KeyframeGraph:
             raise ValueError(f"take: expected a copy of {len(self.keyframes)} keyframes, got {len(aside.keyframes)}")
         self.edges, self.variables, self.intrinsics = aside.edges, aside.variables, aside.intrinsics
 
+    def become(self, other: KeyframeGraph) -> None:
+        """Hold what another graph holds: one that was written down earlier."""
+        vars(self).update(vars(other))
+
     # -- poses, depths, intrinsics, weights ------------------------------------------------------------------
 
     def set_intrinsics(self, intrinsics: Intrinsics) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from types import TracebackType
@@ -28,16 +28,17 @@ from ..export.mask_video import MaskVideo
 from ..export.run_folder import RunFolder
 from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
-from ..graph.focal_sigma import focal_knowledge
+from ..graph.focal_sigma import focal_facts
 from ..graph.initialisation import bootstrap
-from ..graph.intrinsics import PRIOR_FOCAL_SIGMA
 from ..graph.keyframe_graph import KeyframeGraph
 from ..mapping.process import Outcome
 from ..mapping.rasterise import accelerator
 from ..parts import Parts
 from ..progress import Reporter
 from ..tracking.depth_prior import own_depth_spread
+from ..tracking.memory import TrackingMemory
 from ..types import Frame, Source, StaticCloud
+from .checkpoints import Checkpoints, JobMemory, Stage
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from .live_map import LiveMap
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
@@ -82,7 +83,9 @@ class Tracked:
 class RunJob:
     """One run in progress, as a context: whatever stops it, what was computed until then is written."""
 
-    def __init__(self, tracked: Tracked, folder: RunFolder, reporter: Reporter) -> None:
+    def __init__(
+        self, tracked: Tracked, folder: RunFolder, reporter: Reporter, checkpoints: Checkpoints | None = None
+    ) -> None:
         self.tracked, self.folder, self.reporter = tracked, folder, reporter
         self.config, self.graph, self.source = tracked.config, tracked.graph, tracked.source
         self.frames = 0  # that were tracked
@@ -95,9 +98,11 @@ class RunJob:
         realtime = self.config.mapping.enabled and self.config.mapping.realtime
         self._live = LiveMap(self.config, tracked.map_device) if realtime else None
         self._begun: Outcome | None = None  # the map that was made while tracking
+        self.checkpoints = checkpoints
         folder.write_config(config_to_yaml(self.config))
         source, rectifier = self.source, tracked.rectifier
-        folder.update(source={"path": source.name, "kind": source.kind, "size": list(source.size)})
+        known = folder.record.get("source") or {"path": source.name}
+        folder.update(source={**known, "kind": source.kind, "size": list(source.size)})
         folder.note(*tracked.parts.notes, *([rectifier.note] if rectifier is not None else []))
 
     # -- while tracking ------------------------------------------------------------------------------------
@@ -107,6 +112,22 @@ class RunJob:
         if self._live is not None:
             self._live.after(self.frames, frame, self.graph, self.tracked.lens)
         self.frames += 1
+
+    def keep(self, stage: Stage, tracking: Callable[[], TrackingMemory]) -> None:
+        """Write down how far the run is: at once where a stage has ended, else where it is time."""
+        if self.checkpoints is None or (stage == "tracking" and not self.checkpoints.due()):
+            return
+        spent = time.perf_counter() - self._began
+        tracked_s = self.timings.get("tracking", 0.0) if stage != "tracking" else spent
+        self.checkpoints.write(stage, tracking, JobMemory(self.frames, tracked_s, self._final, self._turns_only))
+
+    def go_on(self, memory: JobMemory) -> None:
+        """From what an earlier process has written down; a map that was begun while tracking is not among it."""
+        self.already_tracked(memory.frames, memory.tracking_s)
+        self._final, self._turns_only = memory.final, memory.turns_only
+        if self._live is not None:
+            self._live.close()
+            self._live = None
 
     def already_tracked(self, frames: int, seconds: float) -> None:
         """So many frames were tracked, in so long, before this job began: they count as its own."""
@@ -242,9 +263,13 @@ class RunJob:
         if evaluation.ate is not None and (aligned := evaluation.ate.table()) is not None:
             self.folder.write_aligned(aligned)
         self.folder.update(timings_s=self.timings)
+        if self.checkpoints is not None:
+            self.folder.update(checkpoints=self.checkpoints.facts())
         record = self.folder.record | self.folder.ending()
         write_run_report(self.folder.path, self.source, evaluation, self._evidence, record)
         self.folder.finish()
+        if self.checkpoints is not None:
+            self.checkpoints.remove()
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -304,7 +329,7 @@ class RunJob:
         self.folder.write_trajectory(trajectory_of(self._final))
         lens = self.tracked.lens()
         camera = lens.radial if isinstance(lens, OpenCvLens) else lens
-        focal = self._focal()
+        focal = focal_facts(graph, given=bool(self.config.camera.intrinsics))
         self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None, **focal)
         lost = [f for f in self._final if f.state == "interpolated"]
         facts: dict[str, Any] = {
@@ -326,16 +351,6 @@ class RunJob:
             few = f"fewer than half of the {len(self._final)} frames were tracked: most of the trajectory is a guess"
             self.folder.note(few)
             log.warning(few)
-
-    def _focal(self) -> dict[str, Any]:
-        """Where the focal length comes from, and its relative 1-sigma; None where it is given."""
-        if self.config.camera.intrinsics:
-            return {"found": "given", "focal_sigma_ratio": None}
-        known = focal_knowledge(self.graph)
-        assumed = known is None or known.assumed
-        sigma_ratio = PRIOR_FOCAL_SIGMA if known is None else known.sigma_ratio
-        start = "EXIF" if self.graph.intrinsics.focal_source == "EXIF" else "assumed"
-        return {"found": start if assumed else "from the video", "focal_sigma_ratio": sigma_ratio}
 
     # -- what stops it ---------------------------------------------------------------------------------------
 

@@ -179,6 +179,17 @@ class Keyframes:
             made, self._pending = self._pending, None
             self.graph.take(made.get())
 
+    # -- what is remembered between frames -------------------------------------------------------------------
+
+    def memory(self) -> tuple[KeyframeGraph | None, int, dict[tuple[int, int], Array]]:
+        """The graph with the newest keyframe's edges, where it is to be taken later, when that was, and flows."""
+        return None if self._pending is None else self._pending.get(), self._newest_at, self.edges.flows
+
+    def remember(self, memory: tuple[KeyframeGraph | None, int, dict[tuple[int, int], Array]]) -> None:
+        """What ``memory`` gave."""
+        aside, self._newest_at, self.edges.flows = memory
+        self._pending = None if aside is None else Future.done(aside)
+
     def joins(self, kf: Keyframe) -> bool:
         """True where ``kf`` shows a place of another submap, and the two have become one."""
         return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places)

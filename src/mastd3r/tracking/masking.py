@@ -28,7 +28,7 @@ class MaskTracker:
 
     def __init__(self, dynamics: DynamicsFilter, graph: KeyframeGraph) -> None:
         self.filter, self._graph = dynamics, graph
-        self._worker = Worker("mask")
+        self._worker, self._closed = Worker("mask"), False
 
     def prior(self, seen: Observation) -> Future[Array]:
         """(h, w) P(moving) before the pose is known: the prior of eq. (2)."""
@@ -48,6 +48,16 @@ class MaskTracker:
             lambda: dilated(self.filter.update(replace(given, features=seen.features.get())).probability)
         )
 
+    def memory(self) -> Any:
+        """What the filter remembers, once all that was asked of it is done."""
+        what = self.filter.memory  # type: ignore[attr-defined]
+        return what() if self._closed else self._worker.submit(what).get()
+
+    def remember(self, memory: Any) -> None:
+        """What ``memory`` gave."""
+        self.filter.remember(memory)  # type: ignore[attr-defined]
+
     def close(self) -> None:
         """End the thread, once all that was asked of it is done."""
         self._worker.close()
+        self._closed = True
