@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -218,6 +219,58 @@ def test_two_places_that_look_alike_do_not_turn_the_map(scene: Any, turn: float,
     graph, _ = drifted(scene, scale=1.0, turn=np.array([0, 0, 0, 0, turn, 0.0]))
     front = Recognises(scene, graph, (2, 9))
     assert bool(close_loops(front, graph, front)) == believed  # type: ignore[arg-type]
+
+
+class Several(Recognises):
+    """Sees several pairs; each may be turned by some angle, the same both ways."""
+
+    def __init__(self, scene: Any, graph: KeyframeGraph, pairs: dict[tuple[int, int], float]) -> None:
+        super().__init__(scene, graph, (-1, -1))
+        self.pairs = pairs
+
+    def best(self, graph: KeyframeGraph, seen: Any, among: list[int], count: int, least: float) -> list[Any]:
+        return [graph.keyframes[i] for i, j in self.pairs if j == seen.index and i in among]
+
+    def relocalised(self, kf: Any, work: Any, prior: Array) -> TwoView | None:
+        view = super().relocalised(kf, work, prior)
+        assert view is not None
+        there = kf.id < work.index
+        yaw = self.pairs[min(kf.id, work.index), max(kf.id, work.index)]
+        turn, pose = se3_exp(np.array([0, 0, 0, 0, yaw if there else -yaw, 0.0])), view.alignment.new_from_ref
+        found = turn @ pose if there else pose @ turn
+        return replace(view, alignment=replace(view.alignment, new_from_ref=found))
+
+
+@pytest.mark.parametrize(
+    ("pairs", "passages", "believed"),
+    [
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[5, 6, 7]], True),
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [], False),  # tracking was good all the way: they look alike
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[11]], False),
+        ({(0, 8): 0.0, (1, 9): 0.0}, [[5, 6, 7]], False),
+        ({(0, 8): 0.0, (1, 9): -0.2, (2, 10): -0.4}, [[5, 6, 7]], False),  # no two say the same
+        ({(0, 8): 0.0, (0, 9): 0.0, (0, 10): 0.0}, [[5, 6, 7]], False),  # one picture that looks like many
+    ],
+)
+def test_a_large_turn_needs_a_bad_passage_and_loops_that_agree(
+    scene: Any,
+    pairs: dict[tuple[int, int], float],
+    passages: list[list[int]],
+    believed: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.doubtful_passages", lambda _: passages)
+    graph, centres = drifted(scene, turn=np.array([0, 0, 0, 0, 0.75, 0.0]))
+    before = off(graph, centres)
+    front = Several(scene, graph, pairs)
+    front.spoilt = {}
+    loops = close_loops(front, graph, front)  # type: ignore[arg-type]
+    assert [(x.i, x.j) for x in loops] == (list(pairs) if believed else [])
+    said = {(i, j): words for i, j, words in graph.loops}
+    assert said.keys() == pairs.keys()
+    assert all(words.startswith("one place" if believed else "not believed") for words in said.values())
+    if believed:
+        assert off(graph, centres) < 0.6 * before
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,7 @@ class GraphConfig:
     kernel_px: float = 0.5  # Cauchy scale of the final optimisation
     loop_overlap_ratio: float = 0.5  # predicted share of points in view that makes an old keyframe a candidate
     min_match_ratio: float = 0.04  # edges with a smaller matched share are dropped
+    loops: bool = True  # places seen again, far apart in time, close the trajectory
 
 
 @dataclass(frozen=True)

@@ -188,7 +188,8 @@ class Slam:
         for submap in sorted(graph.started):
             graph.submap = submap
             retake_passages(graph)
-            close_loops(self.two_view, graph, self.parts.places)
+            if self.config.graph.loops:
+                close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view)
         self.masks.close()

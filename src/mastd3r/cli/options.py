@@ -27,6 +27,8 @@ def config_from_args(args: argparse.Namespace) -> Config:
     for name in ("realtime", "quality", "map_minutes"):
         if args.no_map and getattr(args, name) not in (None, False):
             raise ConfigError(f"--{name.replace('_', '-')}: expected a map to be made, got --no-map")
+    if args.no_loops:
+        config = replace(config, graph=replace(config.graph, loops=False))
     if args.realtime:
         config = replace(config, mapping=replace(config.mapping, realtime=True))
     if args.quality is not None:

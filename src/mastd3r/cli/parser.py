@@ -102,6 +102,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
     p.add_argument("--map-minutes", type=float, metavar="M", help=MINUTES_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
+    p.add_argument("--no-loops", action="store_true", help="places that are seen again do not close the trajectory")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
     p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")
     p.add_argument("--realtime", action="store_true", help="start the map while tracking, in a process of its own")

@@ -67,6 +67,7 @@ class KeyframeGraph:
         self.submap_of: dict[int, int] = {}
         self.started: set[int] = set()  # submaps that have poses and depths
         self.last_report: SolveReport | None = None
+        self.loops: list[tuple[int, int, str]] = []  # two frames that may show one place, and what came of it
 
     # -- reading ---------------------------------------------------------------------------------------------
 

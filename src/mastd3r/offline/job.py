@@ -149,6 +149,7 @@ class RunJob:
         """The joint optimisation over everything, and every frame's pose from it."""
         graph, provider = self.graph, self.tracked.parts.provider
         with self.timed("joint optimisation"):
+            self.folder.update(loops=[{"frames": [i, j], "verdict": said} for i, j, said in graph.loops])
             seen = finish_graph(graph, self.config, needs_motion=provider.depth_sigma_ratio is None)
             self._turns_only = seen is not None and seen.kind == "rotation" and provider.depth_sigma_ratio is None
             if seen is not None:
