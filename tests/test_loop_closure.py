@@ -260,12 +260,15 @@ def test_a_large_turn_needs_a_bad_passage_and_loops_that_agree(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("mastd3r.tracking.loop_closure.doubtful_passages", lambda _: passages)
+    retaken: list[KeyframeGraph] = []
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.retake_passages", retaken.append)
     graph, centres = drifted(scene, turn=np.array([0, 0, 0, 0, 0.75, 0.0]))
     before = off(graph, centres)
     front = Several(scene, graph, pairs)
     front.spoilt = {}
     loops = close_loops(front, graph, front)  # type: ignore[arg-type]
     assert [(x.i, x.j) for x in loops] == (list(pairs) if believed else [])
+    assert retaken == ([graph] if believed else [])  # what was badly explained has other ends now
     said = {(i, j): words for i, j, words in graph.loops}
     assert said.keys() == pairs.keys()
     assert all(words.startswith("one place" if believed else "not believed") for words in said.values())

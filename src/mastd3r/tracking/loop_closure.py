@@ -16,7 +16,7 @@ from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
 from ..graph.covisibility import overlaps
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
-from ..graph.passages import doubtful_passages
+from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
 from ..graph.submaps import with_scale
@@ -71,13 +71,16 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
                 break
             if seen is not None:
                 doubted.append(seen)
-    found += _voted_for(graph, doubted)
+    voted = _voted_for(graph, doubted)
+    found += voted
     for seen in found:
         _connect(graph, seen)
     loops = [seen.loop for seen in found]
     if loops:
         optimise_pose_graph(graph, loops)
         graph.solve_all(10, 2.0)
+    if voted:  # the ends of what was badly explained have moved far
+        retake_passages(graph)
     return loops
 
 
