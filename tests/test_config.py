@@ -18,14 +18,27 @@ from mastd3r.config import (
     RENAMED,
     Config,
     SourceConfig,
+    check_config,
     config_from_dict,
     config_from_yaml,
     config_to_yaml,
     preset,
+    ranges,
     with_override,
 )
 from mastd3r.errors import ConfigError
-from mastd3r.registry import ALIGNMENT, DYNAMICS, FEATURES, MAP_BACKENDS, PLACES, POINTMAPS, SEMANTICS, Registry
+from mastd3r.registry import (
+    ALIGNMENT,
+    DYNAMICS,
+    FEATURES,
+    LARGEST,
+    MAP_BACKENDS,
+    PLACES,
+    POINTMAPS,
+    SEMANTICS,
+    Range,
+    Registry,
+)
 
 
 def test_defaults_survive_a_round_trip(tmp_path: Path) -> None:
@@ -173,12 +186,16 @@ def test_sections_of_sections_are_read_from_yaml_and_from_words(tmp_path: Path) 
     assert config_from_dict(yaml.safe_load(config_to_yaml(config))) == config
 
 
+def half(value: Any) -> Any:
+    return value // 2 if isinstance(value, int) else value / 2
+
+
 @pytest.mark.parametrize("old", sorted(RENAMED))
 def test_an_old_name_sets_the_new_option_and_says_so(
     old: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     new, before = RENAMED[old], leaf(Config(), RENAMED[old])
-    value: Any = [2, 3] if isinstance(before, tuple) else not before if isinstance(before, bool) else before + 1
+    value: Any = [2, 3] if isinstance(before, tuple) else not before if isinstance(before, bool) else half(before)
     section, key = old.split(".")
     file = tmp_path / "c.yaml"
     file.write_text(yaml.safe_dump({section: {key: value}}))
@@ -259,3 +276,72 @@ def test_the_options_as_printed_are_found_by_their_comments() -> None:
         "mapping.hard_weight",
         "mapping.paper_loss",
     ]
+
+
+# -- ranges of numbers -----------------------------------------------------------------------------------------------
+
+
+def numbers(section: Any = None, where: str = "") -> dict[str, Any]:
+    """The default of every number among the options, by dotted key; of a list its first."""
+    section = section or Config()
+    out: dict[str, Any] = {}
+    for f in dataclasses.fields(section):
+        value, hint = getattr(section, f.name), str(f.type)
+        if dataclasses.is_dataclass(value):
+            out |= numbers(value, f"{where}{f.name}.")
+        elif f.name != "intrinsics" and not isinstance(value, bool | str) and "bool" not in hint:
+            out[where + f.name] = value
+    return out
+
+
+def with_value(key: str, value: Any) -> Config:
+    """Built as a library's user does, around every check."""
+    *sections, last = key.split(".")
+    parts: list[Any] = [Config()]
+    for name in sections:
+        parts.append(getattr(parts[-1], name))
+    made = dataclasses.replace(parts.pop(), **{last: value})
+    for name in reversed(sections):
+        made = dataclasses.replace(parts.pop(), **{name: made})
+    return made
+
+
+def test_every_number_has_a_range() -> None:
+    assert set(numbers()) == set(ranges()) and len(ranges()) > 70
+    assert check_config(Config()) == Config()
+
+
+@pytest.mark.parametrize("key", numbers())
+def test_what_is_out_of_range_is_refused_however_it_comes(key: str) -> None:
+    default = numbers()[key]
+    listed = isinstance(default, tuple)
+    for value in (-1, float("nan"), float("inf"), -float("inf"), 10**400, True, "x"):
+        given = (value,) if listed else value
+        with pytest.raises(ConfigError, match=re.escape(key)) as by_library:
+            check_config(with_value(key, given))
+        nested: Any = list(given) if isinstance(given, tuple) else given
+        for part in reversed(key.split(".")):
+            nested = {part: nested}
+        with pytest.raises(ConfigError, match=re.escape(key)):
+            config_from_dict(nested)
+        assert "expected" in str(by_library.value) and len(str(by_library.value)) < 300
+
+
+def test_a_range_says_what_it_is() -> None:
+    assert str(Range(0, 1)) == "0 to 1" and str(Range(0, 1, above=True)) == "above 0, to 1"
+    assert str(Range(1, LARGEST)) == "1 or more"
+    assert str(Range(0, LARGEST, above=True)) == "above 0"
+    Range(0, 1).check(0, "x")
+    with pytest.raises(ConfigError, match="x: expected above 0, to 1, got 0"):
+        Range(0, 1, above=True).check(0, "x")
+
+
+@pytest.mark.parametrize("text", ["seed=2020-01-01", 'seed=!!int "x"', "seed=" + "[" * 5000, "seed=" + "9" * 5000])
+def test_odd_yaml_is_one_short_line(text: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as by_word:
+        with_override(Config(), text)
+    (tmp_path / "c.yaml").write_text(text.replace("=", ": "))
+    with pytest.raises(ConfigError) as by_file:
+        config_from_yaml(tmp_path / "c.yaml")
+    for said in (by_word, by_file):
+        assert "\n" not in str(said.value) and len(str(said.value)) < 400

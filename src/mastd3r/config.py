@@ -17,11 +17,27 @@ from typing import Annotated, Any, Literal
 
 import yaml
 
-from .dynamics.config import DynamicsConfig
+from .dynamics.config import OLD_NAMES, DynamicsConfig
 from .errors import ConfigError
-from .registry import ALIGNMENT, FEATURES, MAP_BACKENDS, PLACES, POINTMAPS, SEMANTICS, Registry
+from .registry import (
+    ALIGNMENT,
+    FEATURES,
+    LARGEST,
+    MAP_BACKENDS,
+    PLACES,
+    POINTMAPS,
+    SEMANTICS,
+    Count,
+    NotNegative,
+    OneOrMore,
+    Positive,
+    Range,
+    Registry,
+    Share,
+)
 
 log = logging.getLogger(__name__)
+SHOWN = 60  # characters of a wrong value that are repeated
 
 PointmapKind = Annotated[str, POINTMAPS]  # names of a registry: also those that were registered from outside
 FeaturesKind = Annotated[str, FEATURES]
@@ -43,9 +59,9 @@ ExecutionKind = Literal["auto", "eager", "graph", "compile"]
 class SourceConfig:
     """Which frames of the source are read."""
 
-    start: int = 0  # first frame, counted from 0
-    end: int | None = None  # one past the last frame; None = to the end
-    stride: int = 1  # every n-th frame
+    start: Count = 0  # first frame, counted from 0
+    end: OneOrMore | None = None  # one past the last frame; None = to the end
+    stride: OneOrMore = 1  # every n-th frame
     kind: SourceKind = "auto"  # the layout; auto: found by looking at the files
 
 
@@ -62,22 +78,26 @@ class CameraConfig:
 class TrackingConfig:
     """What is matched, and when a frame becomes a keyframe (III-B, section 3 of docs/joint_optimisation.md)."""
 
-    area_px: int = 196608  # pixels of the working image (512 x 384); never enlarged
-    cell_px: int = 10  # one matched pixel a cell of this size
-    keyframe_motion_ratio: float = 0.1  # upper quartile of image motion since the keyframe / sqrt(width * height)
-    first_motion_ratio: float = 0.05  # the median of the same, before lens and structure are started
-    keyframe_overlap_ratio: float = 0.55  # matches left of the most since the keyframe, below: new keyframe
-    known_overlap_ratio: float = 0.8  # share of an older keyframe's points in view, above: it may be used again
-    known_motion_ratio: float = 0.06  # median image motion from an older keyframe / width, below: the same
-    min_inlier_ratio: float = 0.35  # below: the pose is not accepted
+    area_px: Annotated[int, Range(1024, 16_777_216)] = 196608  # pixels of the working image (512 x 384); never enlarged
+    cell_px: Annotated[int, Range(2, 256)] = 10  # one matched pixel a cell of this size
+    keyframe_motion_ratio: Annotated[float, Range(0, 10, above=True)] = (
+        0.1  # upper quartile of image motion since the keyframe / sqrt(width * height)
+    )
+    first_motion_ratio: Annotated[float, Range(0, 10, above=True)] = (
+        0.05  # the median of the same, before lens and structure are started
+    )
+    keyframe_overlap_ratio: Share = 0.55  # matches left of the most since the keyframe, below: new keyframe
+    known_overlap_ratio: Share = 0.8  # share of an older keyframe's points in view, above: it may be used again
+    known_motion_ratio: NotNegative = 0.06  # median image motion from an older keyframe / width, below: the same
+    min_inlier_ratio: Share = 0.35  # below: the pose is not accepted
 
 
 @dataclass(frozen=True)
 class AlignmentConfig:
     """Coarse-to-fine correction of one pair (III-B)."""
 
-    chamfer_weight: float = 0.1  # lambda_cham of eq. (12)
-    min_matches: int = 40  # weighted matches below which a pair cannot be aligned
+    chamfer_weight: NotNegative = 0.1  # lambda_cham of eq. (12)
+    min_matches: Annotated[int, Range(4, LARGEST)] = 40  # weighted matches below which a pair cannot be aligned
     as_printed: bool = False  # True: eq. (11)(12) as printed: 3-D residuals alone, on SE(3), for views with own points
 
 
@@ -85,17 +105,17 @@ class AlignmentConfig:
 class GraphConfig:
     """Joint optimisation over keyframes."""
 
-    bootstrap_keyframes: int = 5  # keyframes before lens and structure are started
-    radial_keyframes: int = 12  # keyframes before the first radial term is estimated in the window
-    lens_keyframes: int = 48  # keyframes before principal point and higher radial terms are
-    neighbours: int = 6  # previous keyframes that a new one is matched with
-    covisible: int = 4  # older keyframes, seeing the same place, that a new one is matched with
-    window: int = 8  # keyframes that move in the windowed optimisation
-    window_iterations: int = 4
-    final_iterations: int = 40
-    kernel_px: float = 0.5  # Cauchy scale of the final optimisation
-    loop_overlap_ratio: float = 0.5  # predicted share of points in view that makes an old keyframe a candidate
-    min_match_ratio: float = 0.04  # edges with a smaller matched share are dropped
+    bootstrap_keyframes: Annotated[int, Range(2, LARGEST)] = 5  # keyframes before lens and structure are started
+    radial_keyframes: Count = 12  # keyframes before the first radial term is estimated in the window
+    lens_keyframes: Count = 48  # keyframes before principal point and higher radial terms are
+    neighbours: Count = 6  # previous keyframes that a new one is matched with
+    covisible: Count = 4  # older keyframes, seeing the same place, that a new one is matched with
+    window: Annotated[int, Range(2, LARGEST)] = 8  # keyframes that move in the windowed optimisation
+    window_iterations: OneOrMore = 4
+    final_iterations: OneOrMore = 40
+    kernel_px: Positive = 0.5  # Cauchy scale of the final optimisation
+    loop_overlap_ratio: Share = 0.5  # predicted share of points in view that makes an old keyframe a candidate
+    min_match_ratio: Share = 0.04  # edges with a smaller matched share are dropped
     loops: bool = True  # places seen again, far apart in time, close the trajectory
 
 
@@ -108,21 +128,25 @@ class MappingConfig:
     backend: MapBackendKind = "auto"  # what draws the Gaussians; auto: gsplat on an accelerator, numba on the CPU
     loss: MapLossKind = "full"  # plain: no weight; mask: (13)(14); uncertainty: (15)(16); full: (17)
     quality: MapQualityKind = "standard"  # decides whatever of the next four is not given, by the device
-    width_px: int = 0  # width of the images that the map is trained on and rendered at; 0: by the quality
-    iterations: int | None = None  # optimisation steps, one view each; None: by the quality
-    max_gaussians: int = 0  # 0: by the quality
-    sh_degree: int | None = None  # 0 to 3: spherical harmonics, colour by direction of view; None: by the quality
-    minutes: float = 0.0  # for the training, instead of a number of steps; 0: as many steps as said
-    max_views: int = 160  # training views kept in memory
-    dynamic_weight: float = 0.05  # beta of eq. (14)
+    width_px: Annotated[int, Range(0, 16384)] = (
+        0  # width of the images that the map is trained on and rendered at; 0: by the quality
+    )
+    iterations: OneOrMore | None = None  # optimisation steps, one view each; None: by the quality
+    max_gaussians: Annotated[int, Range(0, 50_000_000)] = 0  # 0: by the quality
+    sh_degree: Annotated[int, Range(0, 3)] | None = (
+        None  # 0 to 3: spherical harmonics, colour by direction of view; None: by the quality
+    )
+    minutes: NotNegative = 0.0  # for the training, instead of a number of steps; 0: as many steps as said
+    max_views: OneOrMore = 160  # training views kept in memory
+    dynamic_weight: Share = 0.05  # beta of eq. (14)
     hard_weight: bool = False  # True: eq. (14) as printed; False: w = 1 - 0.95 p
-    tau_uncertainty_px: float = 2.0  # tau_unc, compared with the residual's norm
-    lambda_uncertainty: float = 0.1  # eq. (17)
+    tau_uncertainty_px: Positive = 2.0  # tau_unc, compared with the residual's norm
+    lambda_uncertainty: NotNegative = 0.1  # eq. (17)
     paper_loss: bool = False  # True: squared error with the weights as printed; False: L1 + 0.2 D-SSIM
-    ssim_share: float = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
+    ssim_share: Share = 0.2  # of D-SSIM in the default loss, the rest is L1; without effect with paper_loss
     exposure: bool = True  # a gain and a bias a colour channel for every training view
     realtime: bool = False  # start the map while tracking runs, in a process of its own
-    realtime_steps: int = 4  # optimisation steps a frame that it may spend meanwhile
+    realtime_steps: Count = 4  # optimisation steps a frame that it may spend meanwhile
     refine_poses: bool = False  # move the training cameras too; then every frame is placed in the map
 
 
@@ -135,9 +159,13 @@ class NetworksConfig:
     precision: PrecisionKind = "auto"  # of the matrix products; auto: bfloat16 on an accelerator, float32 on the CPU
     execution: ExecutionKind = "auto"  # eager: layer by layer; graph: recorded once a size, CUDA only; compile:
     # torch.compile of MASt3R, minutes at the first frame; auto: graph on an accelerator, eager on the CPU
-    depth_sigma_ratio: float = 0.08  # relative 1-sigma of MASt3R's depth of a frame, its scale apart; a run says what
+    depth_sigma_ratio: Annotated[float, Range(0, 10, above=True)] = (
+        0.08  # relative 1-sigma of MASt3R's depth of a frame, its scale apart; a run says what
+    )
     # it found. Chosen: weights to measure it with were not at hand
-    long_side_px: int = 512  # of the image that MASt3R sees, a multiple of 16; it was trained at 512
+    long_side_px: Annotated[int, Range(32, 8192)] = (
+        512  # of the image that MASt3R sees, a multiple of 16; it was trained at 512
+    )
 
 
 HOLDOUT_EVERY = 8  # frames 0, 8, 16 … of those read are never shown to the map
@@ -152,7 +180,7 @@ class Config:
     semantics: SemanticsKind = "auto"
     places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -172,55 +200,7 @@ PRESETS: dict[str, tuple[str, ...]] = {  # name -> what it changes of the defaul
     ),
 }
 
-_DYNAMICS_RENAMED = {
-    "use_motion": "motion.enabled",
-    "flow_noise_px": "motion.flow_noise_px",
-    "texture_noise": "motion.texture_noise",
-    "motion_spread_px": "motion.spread_px",
-    "round_trip_px": "motion.round_trip_px",
-    "pose_doubt_deg": "motion.pose_sigma_deg",
-    "use_doubt": "motion.noise_inflation",
-    "doubt_tolerance": "motion.noise_tolerance",
-    "photo_noise": "photometric.noise",
-    "photo_shift_px": "photometric.shift_px",
-    "photo_gain": "photometric.gain",
-    "clash_gain": "photometric.unexplained_gain",
-    "use_depth": "depth.enabled",
-    "depth_noise_ratio": "depth.noise_ratio",
-    "use_support": "support.enabled",
-    "floating_gain": "support.floating_gain",
-    "use_semantic": "semantic.enabled",
-    "semantic_gain": "semantic.gain",
-    "semantic_share": "semantic.evidence_share",
-    "semantic_floor": "semantic.floor",
-    "semantic_missed": "semantic.missed",
-    "semantic_reach": "semantic.reach_ratio",
-    "use_time": "temporal.enabled",
-    "memory": "temporal.memory",
-    "carry_mismatch": "temporal.carry_mismatch",
-    "gaps": "temporal.filter_gaps",
-    "second_gaps": "temporal.smoother_gaps",
-    "use_future": "temporal.backward",
-    "use_head": "appearance.enabled",
-    "head_share": "appearance.share",
-    "head_limit": "appearance.max_log_odds",
-    "head_memory": "appearance.memory",
-    "use_regions": "refinement.enabled",
-    "region_px": "refinement.region_px",
-    "region_contrast": "refinement.region_contrast",
-    "semantic_contrast": "refinement.semantic_contrast",
-    "chroma_gain": "refinement.chroma_gain",
-    "edge_px": "refinement.edge_px",
-    "edge_contrast": "refinement.edge_contrast",
-    "fine_px": "refinement.fine_px",
-    "fine_contrast": "refinement.fine_contrast",
-    "map_contrast": "refinement.fine_contrast_semantic",
-    "tau_variance": "paper.tau_variance",
-    "tau_sigma": "paper.tau_sigma",
-    "window_px": "paper.window_px",
-    "tau_bayes": "paper.tau_bayes",
-}
-RENAMED = {f"dynamics.{old}": f"dynamics.{new}" for old, new in _DYNAMICS_RENAMED.items()}  # old dotted key -> new
+RENAMED = {f"dynamics.{old}": f"dynamics.{new}" for old, new in OLD_NAMES.items()}  # old dotted key -> new
 
 
 def config_from_dict(data: dict[str, Any], base: Config | None = None) -> Config:
@@ -242,7 +222,7 @@ def config_from_yaml(path: Path, base: Config | None = None) -> Config:
     """Read a YAML file of overrides of ``base`` (the defaults). Raises ConfigError."""
     try:
         data = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as e:
         raise ConfigError(f"config file {path}: expected readable YAML, got {_one_line(e)}") from e
     if not isinstance(data, dict):
         raise ConfigError(f"config file {path}: expected key: value pairs, got {type(data).__name__}")
@@ -256,11 +236,31 @@ def with_override(config: Config, dotted: str) -> Config:
         raise ConfigError(f"--set: expected section.key=value, got {dotted!r}")
     try:
         nested: Any = yaml.safe_load(text)
-    except yaml.YAMLError as e:
-        raise ConfigError(f"--set {key}: expected a YAML value, got {text!r} ({_one_line(e)})") from e
+    except (yaml.YAMLError, ValueError, RecursionError) as e:
+        raise ConfigError(f"--set {key}: expected a YAML value, got {_shortly(text)} ({_one_line(e)})") from e
     for part in reversed(key.split(".")):
         nested = {part: nested}
     return _merged(config, nested)
+
+
+def check_config(config: Config) -> Config:
+    """The same. Raises ConfigError for a value of the wrong type or out of its range, however it came there."""
+    return _merged(config, dataclasses.asdict(config))
+
+
+def ranges(section: Any = None, where: str = "") -> dict[str, str]:
+    """What the numbers among the options may be, in words, by dotted key."""
+    section = section or Config()
+    out: dict[str, str] = {}
+    for name, hint in typing.get_type_hints(type(section), include_extras=True).items():
+        value = getattr(section, name)
+        if is_dataclass(value):
+            out |= ranges(value, f"{where}{name}.")
+        for part in (hint, *typing.get_args(hint)):
+            for rule in getattr(part, "__metadata__", ()):
+                if isinstance(rule, Range):
+                    out[where + name] = str(rule)
+    return out
 
 
 def config_to_yaml(config: Config) -> str:
@@ -335,10 +335,14 @@ def _merge(obj: Any, data: Any, where: str) -> Any:
 
 
 def _chosen(value: Any, hint: Any, where: str) -> Any:
-    """A value of a registry's names, or of a Literal."""
+    """A value of a registry's names, within a range, or of a Literal."""
     if typing.get_origin(hint) is Annotated:
-        registry: Registry = hint.__metadata__[0]
-        return registry.check(value, where=f"config {where}")
+        rule: Registry | Range = hint.__metadata__[0]
+        if isinstance(rule, Range):
+            value = _checked(value, hint.__origin__, where)
+            rule.check(value, f"config {where}")
+            return value
+        return rule.check(value, where=f"config {where}")
     options = typing.get_args(hint)
     if value not in options:
         raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
@@ -358,7 +362,19 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
             raise ConfigError(f"config {where}: expected a list, got {value!r}")
         return tuple(_checked(v, typing.get_args(hint)[0], where) for v in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return _as_float(value, where)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ConfigError(f"config {where}: expected {hint.__name__}, got {value!r}")
+        raise ConfigError(f"config {where}: expected {hint.__name__}, got {_shortly(value)}")
     return value
+
+
+def _as_float(value: int, where: str) -> float:
+    try:
+        return float(value)
+    except OverflowError as e:
+        raise ConfigError(f"config {where}: expected a number, got one of {len(str(abs(value))[:20])}+ digits") from e
+
+
+def _shortly(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .concurrency import one_blas_thread
-from .config import Config, config_from_yaml, config_to_yaml
+from .config import Config, check_config, config_from_yaml, config_to_yaml
 from .errors import InputError
 from .evaluation.evaluate import evaluate_trajectory as score
 from .export.claim import CHECKPOINT, stopped_run
@@ -57,7 +57,7 @@ def reconstruct(
     files are in ``out``/unfinished. command and reporter: what run.json and the terminal show.
     Raises SlamError children; what was computed until then is in the run folder, with run.log.
     """
-    config, reporter = config or Config(), reporter or Silent()
+    config, reporter = check_config(config or Config()), reporter or Silent()
     if not isinstance(source, str | Path):
         return _of_images(source, config, _Wanted(out, overwrite, command), reporter)
     read = {"path": _absolute(source), "maps": None if maps is None else _absolute(maps)}

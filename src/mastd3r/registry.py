@@ -1,4 +1,6 @@
-"""Names of the parts that can be replaced. The command line's choices, the checks of options and ``doctor`` read them.
+"""Names of the parts that can be replaced, and ranges of the numbers among the options.
+
+The command line's choices, the checks of options and ``doctor`` read them.
 
 A part of your own is one file and one line:
 
@@ -16,11 +18,44 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 from .errors import ConfigError
 
 AUTO = "auto"
+LARGEST = 10**9  # of a number that has no other bound
+
+
+@dataclass(frozen=True)
+class Range:
+    """What a number among the options may be; it stands beside the field, in ``Annotated``. Always finite."""
+
+    low: float
+    high: float
+    above: bool = False  # ``low`` itself is too little
+
+    def check(self, value: float, where: str) -> None:
+        """Raises ConfigError, naming ``where``."""
+        enough = value > self.low if self.above else value >= self.low
+        if not (enough and value <= self.high):  # NaN is neither
+            raise ConfigError(f"{where}: expected {self}, got {_shortly(value)}")
+
+    def __str__(self) -> str:
+        low = f"{self.low:.12g}"
+        if self.high >= LARGEST:
+            return f"above {low}" if self.above else f"{low} or more"
+        return f"above {low}, to {self.high:.12g}" if self.above else f"{low} to {self.high:.12g}"
+
+
+def _shortly(value: float) -> str:
+    return "a number of hundreds of digits" if isinstance(value, int) and abs(value) > 10**300 else f"{value:.12g}"
+
+
+Share = Annotated[float, Range(0, 1)]
+NotNegative = Annotated[float, Range(0, LARGEST)]
+Positive = Annotated[float, Range(0, LARGEST, above=True)]
+Count = Annotated[int, Range(0, LARGEST)]
+OneOrMore = Annotated[int, Range(1, LARGEST)]
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .camera.rectification import Rectifier, rectifier_for
 from .concurrency import Future, one_blas_thread, undivided
-from .config import Config
+from .config import Config, check_config
 from .errors import InputError
 from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
@@ -82,7 +82,7 @@ class Slam:
         Without one, frames are kept on disk until ``finish``. ``parts``: instead of those that the options name.
         Raises ConfigError and InputError for options that this machine or source cannot serve.
         """
-        self.config = config or Config()
+        self.config = check_config(config or Config())
         given = self.config.camera.intrinsics
         self.recorded = None if source is not None else _recorded(self.config, size)
         self.source: Source = source if source is not None else self.recorded  # type: ignore[assignment]

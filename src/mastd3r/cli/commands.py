@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from ..config import Config, config_to_yaml
+from ..config import Config, config_to_yaml, ranges
 from ..errors import ConfigError
 from .options import checked_minutes, config_from_args
 from .signals import end_this_command
@@ -189,4 +189,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     device, reason = map_device("auto")
     Console().print(f"pointmaps auto: {kind} ({why}) · map auto: {device} ({reason})")
     Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
+    Console().print("[dim]numbers may be:[/dim]")
+    for key, words in ranges().items():
+        Console().print(f"{key}: {words}", highlight=False, markup=False)
     return 0

@@ -6,7 +6,7 @@ import argparse
 import math
 from dataclasses import replace
 
-from ..config import Config, config_from_yaml, preset, with_override
+from ..config import Config, check_config, config_from_yaml, preset, with_override
 from ..errors import ConfigError
 
 
@@ -45,7 +45,7 @@ def config_from_args(args: argparse.Namespace) -> Config:
     elif args.intrinsics is not None:
         given = _numbers(args.intrinsics)
         config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
-    return config
+    return check_config(config)
 
 
 def checked_minutes(minutes: float, option: str) -> float:
