@@ -22,6 +22,7 @@ from ..config import Config, config_to_yaml
 from ..errors import InputError, SlamError
 from ..evaluation.evaluate import evaluate
 from ..export.evidence import EvidenceSample
+from ..export.frame_names import names_by_time
 from ..export.machine import peak_rss_mib
 from ..export.mask_video import MaskVideo
 from ..export.run_folder import RunFolder
@@ -44,6 +45,7 @@ from .placement import place_frames
 from .run_report import write_run_report
 from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
 from .static_cloud import static_cloud
+from .tracks import static_tracks
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -76,6 +78,12 @@ class Tracked:
         if self.rectifier is not None:
             return self.rectifier.lens
         return self.graph.camera().resized(*self.source.size)
+
+    def photograph_px(self, px: Array) -> Array:
+        """(m, 2) pixels at working size as pixels of the photograph."""
+        if self.rectifier is not None:
+            return self.rectifier.lens.project(self.graph.camera().rays(px))
+        return (px + 0.5) * np.array(self.source.size) / np.array(self.graph.size) - 0.5
 
 
 class RunJob:
@@ -166,6 +174,8 @@ class RunJob:
         cloud = static_cloud(self.graph, colors, seen.moving)
         if not self._turns_only:
             self.folder.write_cloud(cloud)
+            px = self.tracked.photograph_px
+            self.folder.write_tracks(static_tracks(self.graph, self._final, colors, seen.moving, px))
         return MapMaterial(cloud, seen, map_view)
 
     def make_map(self, material: MapMaterial) -> None:
@@ -316,6 +326,7 @@ class RunJob:
         self.folder.update(
             camera=facts,
             graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
+            files=names_by_time(self.source, [(f.record.index, f.record.timestamp_s) for f in self._final]),
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
