@@ -84,7 +84,7 @@ def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
     if kind == "spz":
         write_gaussians_spz(out, gaussians)
         return out
-    lens, facts = lens_of(run), _facts(run)
+    lens, facts = lens_of(run), map_facts(run)
     splat = Splat(gaussians, NEAR_RATIO * facts["median_depth"])
     if kind == "flight":
         poses = flight_path(run.trajectory.timestamps_s, run.trajectory.world_from_cam)
@@ -112,7 +112,8 @@ def lens_of(run: Run) -> Camera | OpenCvLens:
     return OpenCvLens(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height, run.distortion)
 
 
-def _facts(run: Run) -> dict[str, Any]:
+def map_facts(run: Run) -> dict[str, Any]:
+    """What run.json says of the map. Raises InputError where there is none."""
     facts = run.record.get("map")
     if not isinstance(facts, dict) or "median_depth" not in facts:
         raise InputError(f"{run.path}/run.json: expected what was written of the map (key map), got none")
