@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import mastd3r
 from made_runs import MadeRun, edited_record, made_run
 from mastd3r.camera.pinhole import Camera
-from mastd3r.errors import ConfigError, InputError, OutputError
+from mastd3r.errors import ConfigError, InputError, MissingPackage, OutputError
 from mastd3r.export.formats import evenly
 from mastd3r.export.trajectory_files import read_trajectory
 
@@ -54,6 +56,36 @@ def test_evo_reads_all_three(run: MadeRun) -> None:
     assert np.allclose(interface.read_tum_trajectory_file(exported(run, "tum")).poses_se3, poses[MEASURED], atol=1e-8)
     assert np.allclose(interface.read_euroc_csv_trajectory(exported(run, "euroc")).poses_se3, poses[MEASURED])
     assert np.allclose(interface.read_kitti_poses_file(exported(run, "kitti")).poses_se3, poses, atol=1e-8)
+
+
+def test_evo_reads_the_ros_bag_whose_map_is_upright(run: MadeRun) -> None:
+    """Both topics say the same poses; gravity, along +y in our world, is along -z in the map."""
+    rosbag2, typesys = (pytest.importorskip(f"rosbags.{n}") for n in ("rosbag2", "typesys"))
+    interface = pytest.importorskip("evo.tools.file_interface")
+    out = exported(run, "ros")
+    ours = run.trajectory.world_from_cam[MEASURED]
+    map_from_world = Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    assert np.allclose(map_from_world @ [0, 1, 0], [0, 0, -1])
+    with rosbag2.Reader(out / "trajectory") as bag:
+        read = interface.read_bag_trajectory(bag, "/camera/pose")
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        said = [store.deserialize_cdr(raw, c.msgtype) for c, _, raw in bag.messages() if c.topic == "/tf"]
+    assert np.allclose(read.timestamps, run.trajectory.timestamps_s[MEASURED], atol=1e-9)
+    assert np.allclose(read.positions_xyz, ours[:, :3, 3] @ map_from_world.T, atol=1e-8)
+    assert np.allclose([p[:3, :3] for p in read.poses_se3], map_from_world @ ours[:, :3, :3], atol=1e-8)
+    for (placed,), position, wxyz in zip(
+        [m.transforms for m in said], read.positions_xyz, read.orientations_quat_wxyz, strict=True
+    ):
+        assert (placed.header.frame_id, placed.child_frame_id) == ("map", "camera_optical_frame")
+        t, q = placed.transform.translation, placed.transform.rotation
+        assert np.allclose([t.x, t.y, t.z], position) and np.allclose([q.w, q.x, q.y, q.z], wxyz)
+
+
+def test_a_bag_without_its_package_is_one_line(run: MadeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(MissingPackage, match=r"rosbags: pip install 'mastd3r-slam\[ros\]'"):
+        exported(run, "ros")
+    assert not (run.path.parent / "deep").exists()
 
 
 def test_kitti_rows_are_all_poses(run: MadeRun, caplog: pytest.LogCaptureFixture) -> None:

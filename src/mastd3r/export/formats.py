@@ -12,30 +12,38 @@ from numpy.typing import NDArray
 from ..errors import ConfigError, InputError
 from ..geometry.quaternion import quaternion_from_rotation
 from ..types import Trajectory
+from .export_folder import export_folder
 from .files import write_text, writing
 from .kinds import TRAJECTORIES
 from .read_run import Run
+from .ros import check_package, write_ros
 from .trajectory_files import write_tum
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+BAG = "trajectory"  # folder of the bag
 EUROC_HEADER = "#timestamp [ns],p_x,p_y,p_z [map units],q_w,q_x,q_y,q_z (world_from_cam)\n"
 
 
 def export_trajectory(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> Path:
-    """Write a run's poses (world_from_cam, OpenCV axes, map units) to the file ``out``; gives it.
+    """Write a run's poses (world_from_cam, OpenCV axes, map units) to ``out``, a file, for ros a folder; gives it.
 
-    tum: timestamp, position, quaternion xyzw. euroc: nanoseconds, position, quaternion wxyz, with commas. Both have
-    the poses that were measured, and with ``all_poses`` the interpolated ones. kitti: 12 numbers a row, the top of
-    world_from_cam; its rows have no time, so every frame has one, and all poses are there.
+    tum: timestamp, position, quaternion xyzw. euroc: nanoseconds, position, quaternion wxyz, with commas. ros: a bag,
+    see ``write_ros``. These have the poses that were measured, and with ``all_poses`` the interpolated ones. kitti:
+    12 numbers a row, the top of world_from_cam; its rows have no time, so every frame has one, and all poses are there.
     Raises InputError for a run that lacks what the format needs, OutputError where ``out`` cannot be written,
-    ConfigError for an unknown kind.
+    ConfigError for an unknown kind, MissingPackage for ros without rosbags.
     """
     if kind not in TRAJECTORIES:
         raise ConfigError(f"export: expected one of {', '.join(TRAJECTORIES)}, got {kind!r}")
     trajectory = exported_poses(run, all_poses or kind == "kitti")
     if kind == "kitti":
         _refuse_gaps(run)
+    if kind == "ros":
+        check_package()
+        with export_folder(out, {"kind": kind, "run": str(run.path.resolve())}, []) as staged:
+            write_ros(staged / BAG, trajectory)
+        return out
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
     if kind == "tum":

@@ -6,6 +6,7 @@ TRAJECTORIES = {
     "tum": "timestamp tx ty tz qx qy qz qw",
     "kitti": "12 numbers a row",
     "euroc": "CSV: nanoseconds, position, quaternion wxyz",
+    "ros": "a folder with a ROS 2 bag",
 }
 PICTURES = {
     "colmap": "a folder with images, masks and sparse/0",

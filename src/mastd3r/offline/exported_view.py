@@ -19,6 +19,7 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MARGIN = np.ones((5, 5), np.uint8)  # masks grow by two of their pixels: the edge of a moving thing is not static
 STATIC, IGNORED = 255, 0
+MOVES_LEVEL = 255 / 4  # P(moving) from which a pixel is left out: what moves costs a map more than a static rim missing
 KEEP = "use --no-undistort"
 
 
@@ -50,18 +51,22 @@ class ExportedView:
     def mask(self, levels: Array) -> Array:
         """(h, w) uint8, 255 = stands still, of P(moving) over the photograph (h', w'), 255 = certain.
 
-        What more likely moves than not is 0, with a margin of two pixels of ``levels``.
+        What moves with a probability above 1/4 is 0, with a margin of two pixels of ``levels``.
         """
-        moving = cv2.dilate(levels, MARGIN).astype(np.float32)
-        photograph = cv2.resize(moving, (self._lens.width, self._lens.height), interpolation=cv2.INTER_LINEAR)
-        seen = photograph if self._rectifier is None else self._rectifier.semantic(photograph)
-        return np.where(seen > 127.5, IGNORED, STATIC).astype(np.uint8)
+        grown = over_photograph(cv2.dilate(levels, MARGIN), (self._lens.width, self._lens.height))
+        seen = grown if self._rectifier is None else self._rectifier.semantic(grown)
+        return np.where(seen > MOVES_LEVEL, IGNORED, STATIC).astype(np.uint8)
 
     def px(self, px: Array) -> Array:
         """(m, 2) pixels of the photograph as pixels of the image; an integer is a pixel centre in both."""
         if self._rectifier is None:
             return np.asarray(px, float)
         return self._rectifier.pinhole.project(self._rectifier.lens.rays(px))
+
+
+def over_photograph(levels: Array, size: tuple[int, int]) -> Array:
+    """(h, w) float32 of a mask's levels (h', w'), for a photograph of ``size`` (width, height)."""
+    return np.asarray(cv2.resize(levels.astype(np.float32), size, interpolation=cv2.INTER_LINEAR))
 
 
 def _rectifier_of(lens: Camera | OpenCvLens) -> Rectifier:

@@ -12,10 +12,11 @@ from ..camera.map_view import MapView
 from ..export.read_run import Run
 from ..mapping.ply import read_gaussians_ply
 from ..mapping.splat import NEAR_RATIO, Splat
+from .exported_view import MOVES_LEVEL, over_photograph
 from .renders import lens_of, map_facts
 
 Array = NDArray[Any]
-MARGIN_RATIO = 0.006  # of the image's width: what moves is replaced with so much around it
+MARGIN_RATIO = 0.01  # of the image's width: what moves is replaced with so much around it
 FEATHER_RATIO = 0.004  # of the image's width: sigma over which photograph and splat blend
 
 
@@ -42,10 +43,10 @@ class Plates:
 def feathered(levels: Array, size: tuple[int, int]) -> Array:
     """(h, w) float32 share of the splat over an image of ``size`` (width, height); levels: P(moving), 255 = certain.
 
-    1 wherever something more likely moves than not, falling to 0 around it.
+    1 wherever something moves with a probability above 1/4, falling to 0 around it.
     """
     width = size[0]
-    moving = (cv2.resize(levels.astype(np.float32), size, interpolation=cv2.INTER_LINEAR) > 127.5).astype(np.float32)
+    moving = (over_photograph(levels, size) > MOVES_LEVEL).astype(np.float32)
     margin, sigma = max(1, round(MARGIN_RATIO * width)), max(0.5, FEATHER_RATIO * width)
     grown = cv2.dilate(moving, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))
     return np.maximum(moving, cv2.GaussianBlur(grown, (0, 0), sigma))
