@@ -183,8 +183,10 @@ def what_is_shown_of_a_map(out: Path, holdout: set[str], tmp_path: Path) -> None
     facts = json.loads((out / "run.json").read_text())["map"]
     assert facts["device"] == "cpu" and facts["near"] > 0
     assert main(["export", str(out), "--to", "depth", "--out", str(tmp_path / "depth")]) == 0
-    for folder in (out / "depth", tmp_path / "depth"):
-        assert {p.name for p in folder.iterdir()} == holdout
+    assert {p.name for p in (out / "depth").iterdir()} == holdout
+    assert len(list((tmp_path / "depth").glob("*.png"))) == metrics_of(out)["frames_tracked"]
+    said = json.loads((tmp_path / "depth" / "export.json").read_text())
+    assert said["depth_png_per_unit"] == facts["depth_png_per_unit"]
     name = sorted(holdout)[1]
     kept, again = (cv2.imread(str(f / name), cv2.IMREAD_UNCHANGED) for f in (out / "depth", tmp_path / "depth"))
     assert kept.dtype == np.uint16 and (kept > 0).mean() > 0.5

@@ -13,6 +13,6 @@ PICTURES = {
     "nerfstudio": "a folder with images, masks and transforms.json",
     "plates": "a folder with the photographs, what moves replaced by the splat",
 }
-SPLATS = {"spz": "the splat in a small file", "flight": "an .mp4", "depth": "a folder of 16-bit depth images"}
+SPLATS = {"spz": "the splat in a small file", "flight": "an .mp4", "depth": "a folder of 16-bit images, one a frame"}
 UNDISTORTING = ("colmap", "nerfstudio")  # write the lens with their images
 KINDS = {**TRAJECTORIES, **PICTURES, **SPLATS}

@@ -243,7 +243,7 @@ class Reconstruction:
         out = Path(out).expanduser()
         _check_export(kind, source, undistort, all_poses)
         if kind in SPLATS:
-            return export_splat(self.path, kind, out)
+            return export_splat(self._run, kind, out, all_poses=all_poses)
         if kind in TRAJECTORIES:
             return export_trajectory(self._run, kind, out, all_poses=all_poses)
         path = self._photographs(source)
@@ -260,7 +260,7 @@ def _check_export(kind: str, source: str | Path | None, undistort: bool | None, 
     said = {
         "source": (source is not None, PICTURES),
         "undistort": (undistort is not None, UNDISTORTING),
-        "all-poses": (all_poses, (*TRAJECTORIES, *PICTURES)),
+        "all-poses": (all_poses, (*TRAJECTORIES, *PICTURES, "depth")),
     }
     for option, (given, kinds) in said.items():
         if given and kind not in kinds:
