@@ -86,7 +86,7 @@ def test_the_same_seed_gives_the_same_bytes(room_clip: Path, tmp_path: Path) -> 
     for name in ("a", "b"):
         out = tmp_path / name
         assert main(["run", str(room_clip), "--out", str(out), "--no-map", "--quiet", "--seed", "3"]) == 0
-    for file in ("trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply"):
+    for file in ("trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "tracks.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 

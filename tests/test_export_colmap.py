@@ -49,8 +49,9 @@ def test_their_projection_is_our_camera(name: str) -> None:
     np.testing.assert_allclose(theirs, LENSES[name].project(points) + 0.5, atol=1e-9)
 
 
-def test_text_and_binary_say_the_same(tmp_path: Path) -> None:
+def test_text_and_binary_say_the_same(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     out, binary = exported(made_run(tmp_path, BENT), tmp_path)
+    assert "the lens is bent: images are undistorted to a pinhole of" in caplog.text
     text = read_text(out / "sparse" / "0")
     assert text.camera[:3] == binary.camera[:3] and np.allclose(text.camera[3], binary.camera[3], rtol=1e-11)
     assert list(text.images) == list(binary.images) and list(text.points) == list(binary.points)
@@ -153,6 +154,18 @@ def test_frames_of_a_video_are_extracted(tmp_path: Path, caplog: pytest.LogCaptu
     frames = {f.index: f.image for f in open_source(video, SourceConfig()).frames()}
     assert np.array_equal(Image.open(out / "images" / names[2]), frames[3])
     assert not caplog.text
+
+
+@pytest.mark.parametrize("what", ["empty", "text", "cut", "changed"])
+def test_tracks_that_cannot_be_read_are_one_line(tmp_path: Path, what: str) -> None:
+    run = made_run(tmp_path, STRAIGHT)
+    file = run.path / "tracks.npz"
+    whole = file.read_bytes()
+    changed = whole[:200] + bytes(64) + whole[264:]
+    file.write_bytes({"empty": b"", "text": b"tracks", "cut": whole[: len(whole) // 2], "changed": changed}[what])
+    with pytest.raises(InputError, match=r"tracks\.npz: expected the tracks of a run, got") as caught:
+        exported(run, tmp_path)
+    assert "\n" not in str(caught.value) and not (tmp_path / "out").exists()
 
 
 def test_photographs_that_moved_are_named(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,5 +56,5 @@ def read_tracks(path: Path) -> Tracks:
     try:
         with np.load(path, allow_pickle=False) as packed:
             return Tracks(**{name: packed[name] for name in Tracks.__dataclass_fields__})
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as e:
         raise InputError(f"{path}: expected the tracks of a run, got {e}") from e

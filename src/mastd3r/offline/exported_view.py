@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from typing import Any
 
 import cv2
@@ -16,7 +15,6 @@ from ..errors import ConfigError, InputError
 from ..export.lens_models import distortion_of
 
 Array = NDArray[Any]
-log = logging.getLogger(__name__)
 MARGIN = np.ones((5, 5), np.uint8)  # masks grow by two of their pixels: the edge of a moving thing is not static
 STATIC, IGNORED = 255, 0
 MOVES_LEVEL = 255 / 4  # P(moving) from which a pixel is left out: what moves costs a map more than a static rim missing
@@ -31,8 +29,6 @@ class ExportedView:
         self._lens, self._rectifier = lens, None
         if lens.distorted and undistort is not False:
             self._rectifier = _rectifier_of(lens)
-            size = "x".join(map(str, self._rectifier.size))
-            log.warning("the lens is bent: images are undistorted to a pinhole of %s; or %s", size, KEEP)
 
     @property
     def undistorts(self) -> bool:

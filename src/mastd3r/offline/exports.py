@@ -23,7 +23,7 @@ from ..export.run_folder import stamp
 from ..export.tracks import Tracks, read_tracks
 from ..geometry.se3 import inverse
 from ..types import Source, Trajectory
-from .exported_view import ExportedView
+from .exported_view import KEEP, ExportedView
 from .photographs import photographs, write_photograph
 from .plates import Plates
 from .renders import lens_of
@@ -64,6 +64,9 @@ def export_pictures(
     facts = {"kind": kind, "run": str(run.path.resolve()), "undistorted": view.undistorts}
     with export_folder(out, facts, [source_path]) as staged:
         write(staged, run, _write_images(staged, run, trajectory, source, view), view)
+    if view.undistorts and undistort is None:
+        size = f"{view.lens.width}x{view.lens.height}"
+        log.warning("the lens is bent: images are undistorted to a pinhole of %s; or %s", size, KEEP)
     return out
 
 
