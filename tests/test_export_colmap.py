@@ -106,6 +106,18 @@ def test_images_keep_their_names_and_bytes(tmp_path: Path) -> None:
         assert (out / "images" / name).read_bytes() == (run.photographs / "shots" / name).read_bytes()
 
 
+def test_an_image_that_was_turned_when_read_is_written_upright(tmp_path: Path) -> None:
+    """COLMAP does not look at EXIF orientation; our lens is that of the upright image."""
+    run = made_run(tmp_path, STRAIGHT)
+    file = run.photographs / "shots" / NAMES[3]
+    upright, turned = Image.open(file).convert("RGB"), Image.Exif()
+    turned[0x0112] = 6  # to be turned clockwise by a quarter
+    upright.transpose(Image.Transpose.ROTATE_90).save(file, exif=turned)
+    out, _ = exported(run, tmp_path)
+    written = Image.open(out / "images" / NAMES[3])
+    assert np.array_equal(written, upright) and 0x0112 not in written.getexif()
+
+
 @pytest.mark.parametrize("lens", [STRAIGHT, BENT])
 def test_masks_are_black_where_things_move(lens: Camera, tmp_path: Path) -> None:
     out, model = exported(made_run(tmp_path, lens), tmp_path)
