@@ -31,7 +31,7 @@ from mastd3r.export.machine import machine_info
 from mastd3r.export.trajectory_files import read_tum
 from mastd3r.mapping.correction import changes_of
 from mastd3r.mapping.mapper import Mapper
-from mastd3r.offline.job import MapMaterial
+from mastd3r.offline.tracked import MapMaterial
 from mastd3r.sources import open_source
 
 SEQUENCE, MOVED_M, BOUND_DB = "kitchen", 0.05, 0.5

@@ -26,7 +26,7 @@ from mastd3r.config import Config, MappingConfig, with_override
 from mastd3r.evaluation.image_error import psnr, ssim
 from mastd3r.export.machine import machine_info
 from mastd3r.mapping.mapper import Mapper
-from mastd3r.offline.job import MapMaterial
+from mastd3r.offline.tracked import MapMaterial
 from mastd3r.pipeline import material_for_map
 from mastd3r.sources import open_source
 

@@ -86,7 +86,7 @@ def test_the_same_seed_gives_the_same_bytes(room_clip: Path, tmp_path: Path) -> 
     for name in ("a", "b"):
         out = tmp_path / name
         assert main(["run", str(room_clip), "--out", str(out), "--no-map", "--quiet", "--seed", "3"]) == 0
-    for file in ("trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply"):
+    for file in ("trajectory.txt", "keyframes.txt", "camera.json", "cloud.ply", "tracks.npz"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes(), file
 
 
@@ -183,8 +183,10 @@ def what_is_shown_of_a_map(out: Path, holdout: set[str], tmp_path: Path) -> None
     facts = json.loads((out / "run.json").read_text())["map"]
     assert facts["device"] == "cpu" and facts["near"] > 0
     assert main(["export", str(out), "--to", "depth", "--out", str(tmp_path / "depth")]) == 0
-    for folder in (out / "depth", tmp_path / "depth"):
-        assert {p.name for p in folder.iterdir()} == holdout
+    assert {p.name for p in (out / "depth").iterdir()} == holdout
+    assert len(list((tmp_path / "depth").glob("*.png"))) == metrics_of(out)["frames_tracked"]
+    said = json.loads((tmp_path / "depth" / "export.json").read_text())
+    assert said["depth_png_per_unit"] == facts["depth_png_per_unit"]
     name = sorted(holdout)[1]
     kept, again = (cv2.imread(str(f / name), cv2.IMREAD_UNCHANGED) for f in (out / "depth", tmp_path / "depth"))
     assert kept.dtype == np.uint16 and (kept > 0).mean() > 0.5

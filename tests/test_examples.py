@@ -37,7 +37,7 @@ def test_a_video_and_its_score(
     out = tmp_path / "run"
     run(1, room_clip, out, "mapping.iterations=20", "mapping.width_px=80", monkeypatch=monkeypatch)
     said = capsys.readouterr().out
-    assert "24 poses" in said and "Gaussians" in said and (out / "colmap" / "images.txt").is_file()
+    assert "24 poses" in said and "Gaussians" in said and (out / "colmap" / "sparse" / "0" / "images.bin").is_file()
     run(6, out, room_clip, monkeypatch=monkeypatch)
     ate = float(capsys.readouterr().out.split("ATE ")[1].split()[0])
     assert ate == pytest.approx(mastd3r.load(out).metrics["ate_rmse_all"], abs=1e-4)

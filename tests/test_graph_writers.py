@@ -24,6 +24,7 @@ WRITERS = {
 # base of an attribute of the same name that is something else: reason
 NOT_OF_THE_GRAPH = {
     "ctx": "what torch keeps for the way back of a function",
+    "bits": "a random generator's own",
     "out": "the masks of the smoothing pass, while they are collected",
 }
 

@@ -93,6 +93,7 @@ def test_a_reconstruction_says_what_is_in_its_folder(whole: mastd3r.Reconstructi
     assert whole.gaussians is None and any(n.startswith("pointmaps: geometric") for n in whole.notes)
     for kind, name in (("tum", "poses.txt"), ("kitti", "poses.kitti"), ("colmap", "colmap")):
         assert whole.export(kind, tmp_path / name).exists()
+    assert whole.export("nerfstudio", tmp_path / "nerf", undistort=False, all_poses=True).is_dir()
     with pytest.raises(mastd3r.ConfigError, match="expected one of tum"):
         whole.export("usd", tmp_path / "x")
     with pytest.raises(InputError, match=r"gaussians\.ply"):

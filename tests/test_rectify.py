@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from colmap_reader import read_binary
 from mastd3r.camera.map_view import MapView
 from mastd3r.camera.opencv_lens import OpenCvLens, lens_from_intrinsics
 from mastd3r.camera.rectification import Rectifier, rectifier_for
@@ -311,9 +312,11 @@ def test_a_calibrated_bent_lens_is_as_good_as_a_straight_one(track: Callable[...
     assert [camera[k] for k in ("fx_px", "fy_px", "cx_px", "cy_px", "width", "height")] == [*ROOM[:4], *ROOM_SIZE]
     assert (camera["k1"], camera["k2"], camera["k3"]) == (-0.28, 0.09, 0.0)
     assert camera["distortion"] == list(ROOM[4:])
-    assert main(["export", str(run), "--to", "colmap", "--out", str(run / "colmap")]) == 0
-    words = (run / "colmap" / "cameras.txt").read_text().splitlines()[1].split()
+    assert main(["export", str(run), "--to", "colmap", "--out", str(run / "colmap"), "--no-undistort"]) == 0
+    words = (run / "colmap" / "sparse" / "0" / "cameras.txt").read_text().splitlines()[1].split()
     assert words[1] == "OPENCV" and [float(w) for w in words[4:]] == [225, 220.5, 123.5, 87.5, *ROOM[4:]]
+    errors_px = read_binary(run / "colmap" / "sparse" / "0").errors_px()  # tracks come back through the lens
+    assert len(errors_px) > 1000 and 0 < errors_px.mean() < 1
     assert record["camera"]["distortion"] == list(ROOM[4:]) and record["camera"]["found"] == "given"
     assert distorted["focal_px"] == record["camera"]["focal_px"] == pytest.approx(np.sqrt(ROOM[0] * ROOM[1]))
     assert any(c.startswith("lens: photographs rectified to a pinhole of 222.7 px") for c in record["choices"])

@@ -21,8 +21,9 @@ from .export.claim import CHECKPOINT, stopped_run
 from .export.read_run import read_json
 from .export.run_folder import RunFolder
 from .export.trajectory_files import read_trajectory
-from .offline.job import MapMaterial, RunJob
+from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
+from .offline.tracked import MapMaterial
 from .parts import with_dataset_lens
 from .progress import Reporter, Silent
 from .slam import Slam

@@ -25,8 +25,9 @@ from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.passages import retake_passages
 from .offline.checkpoints import Checkpoints, Memory
-from .offline.job import RunJob, Tracked
+from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
+from .offline.tracked import Tracked
 from .parts import Parts, build_parts, chosen_map_device, with_map_effort
 from .progress import Reporter, Silent
 from .sources.recorded import RecordedSource

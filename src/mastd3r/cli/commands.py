@@ -152,7 +152,9 @@ def export(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r export``."""
     from ..pipeline import load
 
-    written = load(args.run).export(args.to, args.out)
+    run = load(args.run)
+    options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
+    written = run.export(args.to, args.out, **options)
     Console().print(f"wrote {written}", soft_wrap=True, markup=False)
     return 0
 

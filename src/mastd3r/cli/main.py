@@ -9,6 +9,7 @@ from collections.abc import Sequence
 EXIT_FAULT, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 KEPT = "what was computed so far is in the run folder"
 KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
+KEPT_BY["export"] = "nothing half-written stays"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -9,6 +9,7 @@ from typing import NoReturn, get_args
 from .. import __version__
 from ..config import PRESETS, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
+from ..export.kinds import KINDS
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
@@ -48,15 +49,7 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
-    export = known.add_parser("export", help="write a run's trajectory or splat in another format")
-    export.add_argument("run", type=Path, help="run folder")
-    export.add_argument(
-        "--to", choices=("tum", "kitti", "colmap", "spz", "flight", "depth"), required=True, help="the format"
-    )
-    export.add_argument(
-        "--out", type=Path, required=True, help="file (tum, kitti, spz, flight: .mp4) or folder (colmap, depth)"
-    )
-    export.set_defaults(act=commands.export)
+    _export_parser(known.add_parser("export", help="write a run for other tools"))
     view = known.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path, help="run folder")
     view.set_defaults(act=commands.view)
@@ -77,6 +70,20 @@ def _map_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=commands.train_map)
+
+
+def _export_parser(p: argparse.ArgumentParser) -> None:
+    p.add_argument("run", type=Path, help="run folder")
+    p.add_argument("--to", choices=tuple(KINDS), required=True, help="; ".join(f"{k}: {v}" for k, v in KINDS.items()))
+    p.add_argument("--out", type=Path, required=True, help="file or folder to write")
+    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument(
+        "--undistort",
+        action=argparse.BooleanOptionalAction,
+        help="images of a pinhole, or the lens as it is (default: a pinhole where the lens is bent)",
+    )
+    p.add_argument("--all-poses", action="store_true", help="interpolated poses too, not only measured ones")
+    p.set_defaults(act=commands.export)
 
 
 def _eval_parser(p: argparse.ArgumentParser) -> None:

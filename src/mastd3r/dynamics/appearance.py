@@ -44,7 +44,8 @@ class AppearanceClassifier:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
         self._rng = np.random.default_rng()
-        self._rng.bit_generator.state = state["_rng"]
+        bits = self._rng.bit_generator
+        bits.state = state["_rng"]
 
     def copy(self) -> AppearanceClassifier:
         """What it knows now; either may learn on without the other."""

@@ -18,7 +18,8 @@ from .files import writing
 
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4", "run.log",
+    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
+    "tracks.npz", "run.log",
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")
 RECORD_FILE, RESERVE = "run.json", ".reserve"
@@ -41,7 +42,7 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
     or whose names of ours are symbolic links; and for whatever the system refuses.
     """
     with writing(folder):
-        _refuse_inputs(folder, inputs)
+        refuse_inputs(folder, inputs)
         folder.mkdir(parents=True, exist_ok=True)
         _refuse_links(folder)
         unfinished = folder / UNFINISHED
@@ -123,7 +124,7 @@ def check_ours(folder: Path) -> None:
         raise OutputError(f"{folder}: expected a run folder, got a folder whose run.json is not one of a run")
 
 
-def _refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
+def refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
     out = folder.resolve()
     for given in inputs:
         real = given.resolve()

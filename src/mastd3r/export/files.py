@@ -41,9 +41,12 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A temporary beside ``path`` for the body to write; it takes the place of ``path`` only once the body is done."""
-    temporary = path.with_name(path.name + ".part")
+def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
+    """A temporary beside ``path`` for the body to write; it takes the place of ``path`` only once the body is done.
+
+    ``suffix``: what its name must end with, where a writer goes by that.
+    """
+    temporary = path.with_name(f"{path.name}.part{suffix}")
     with writing(path):
         try:
             yield temporary

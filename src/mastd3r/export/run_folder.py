@@ -24,6 +24,7 @@ from .files import write_bytes, write_json, write_text, writing
 from .machine import machine_info
 from .point_cloud import write_cloud
 from .run_log import RunLog
+from .tracks import Tracks, write_tracks
 from .trajectory_files import write_tum
 
 Array = NDArray[Any]
@@ -170,6 +171,10 @@ class RunFolder:
     def write_cloud(self, cloud: StaticCloud) -> None:
         """cloud.ply: the dense static map."""
         write_cloud(self.path / "cloud.ply", cloud)
+
+    def write_tracks(self, tracks: Tracks) -> None:
+        """tracks.npz: static points, and where frames were measured to see them."""
+        write_tracks(self.path / "tracks.npz", tracks)
 
     def write_mask(self, timestamp_s: float, probability: Array) -> None:
         """masks/<timestamp>.png: P(moving), (h, w) in 0..1. A value above 127 is P > 0.5."""

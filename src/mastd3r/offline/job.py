@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from types import TracebackType
 from typing import Any
 
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ..camera.map_view import MapView
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
-from ..camera.rectification import Rectifier
 from ..concurrency import undivided
-from ..config import Config, config_to_yaml
+from ..config import config_to_yaml
 from ..errors import InputError, SlamError, reason_of
 from ..evaluation.evaluate import evaluate
 from ..export.evidence import EvidenceSample
+from ..export.frame_names import names_by_time
 from ..export.machine import peak_rss_mib
 from ..export.mask_video import MaskVideo
 from ..export.run_folder import RunFolder
@@ -30,14 +30,12 @@ from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.focal_sigma import focal_facts
 from ..graph.initialisation import bootstrap
-from ..graph.keyframe_graph import KeyframeGraph
 from ..mapping.process import Outcome
 from ..mapping.rasterise import accelerator
-from ..parts import Parts
 from ..progress import Reporter
 from ..tracking.depth_prior import own_depth_spread
 from ..tracking.memory import TrackingMemory
-from ..types import Frame, Source, StaticCloud
+from ..types import Frame
 from .checkpoints import Checkpoints, JobMemory, Stage
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from .live_map import LiveMap
@@ -46,38 +44,13 @@ from .placement import place_frames
 from .run_report import write_run_report
 from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
 from .static_cloud import static_cloud
+from .tracked import MapMaterial, Tracked
+from .tracks import static_tracks
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 TURNS_ONLY = "the camera only turns: rotations and the lens are found, no depth, no translation, no map"
 NO_MAP_PX = 64  # width of the map's images where there is no map, which nothing is drawn in
-
-
-@dataclass(frozen=True)
-class MapMaterial:
-    """What a map is made from."""
-
-    cloud: StaticCloud
-    seen: SmoothedMasks
-    map_view: MapView
-
-
-@dataclass(frozen=True)
-class Tracked:
-    """What tracking shares with what comes after it."""
-
-    source: Source  # of photographs, as the camera took them
-    config: Config
-    graph: KeyframeGraph
-    parts: Parts
-    rectifier: Rectifier | None
-    map_device: str
-
-    def lens(self) -> Camera | OpenCvLens:
-        """The lens over the photograph: the calibrated one where photographs are rectified."""
-        if self.rectifier is not None:
-            return self.rectifier.lens
-        return self.graph.camera().resized(*self.source.size)
 
 
 class RunJob:
@@ -189,6 +162,8 @@ class RunJob:
         cloud = static_cloud(self.graph, colors, seen.moving)
         if not self._turns_only:
             self.folder.write_cloud(cloud)
+            px = self.tracked.photograph_px
+            self.folder.write_tracks(static_tracks(self.graph, self._final, colors, seen.moving, px))
         return MapMaterial(cloud, seen, map_view)
 
     def make_map(self, material: MapMaterial) -> None:
@@ -345,6 +320,7 @@ class RunJob:
         self.folder.update(
             camera=facts,
             graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
+            files=names_by_time(self.source, [(f.record.index, f.record.timestamp_s) for f in self._final]),
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")

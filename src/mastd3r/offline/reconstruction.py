@@ -21,7 +21,8 @@ from ..errors import ConfigError, InputError
 from ..evaluation.evaluate import evaluate
 from ..export.claim import claim, settle
 from ..export.files import write_json, writing
-from ..export.formats import export_run
+from ..export.formats import export_trajectory
+from ..export.kinds import KINDS, PICTURES, SPLATS, TRAJECTORIES, UNDISTORTING
 from ..export.point_cloud import read_cloud
 from ..export.read_run import Run, read_run
 from ..export.run_folder import RunFolder
@@ -31,11 +32,11 @@ from ..progress import Reporter, Silent
 from ..sources import open_source
 from ..types import StaticCloud
 from .continued_map import continue_map
+from .exports import export_pictures, export_plates
 from .renders import export_splat, lens_of
 from .run_report import write_run_report
 
 Array = NDArray[Any]
-SPLAT_FORMATS = ("spz", "flight", "depth")
 
 
 class Masks(Sequence[Array]):
@@ -226,12 +227,45 @@ class Reconstruction:
         self._run, self._temporary = read_run(target), None
         return target
 
-    def export(self, kind: str, out: str | Path) -> Path:
-        """The run in another format, as ``mastd3r export --to``: tum, kitti, colmap, spz, flight or depth.
+    @one_blas_thread()
+    def export(
+        self,
+        kind: str,
+        out: str | Path,
+        *,
+        source: str | Path | None = None,
+        undistort: bool | None = None,
+        all_poses: bool = False,
+    ) -> Path:
+        """The run in another format, as ``mastd3r export --to``: one of ``export.kinds.KINDS``; gives the path written.
 
-        Raises InputError for a format that is not known or that the run has nothing for, and OutputError.
+        source: where the photographs are, if no longer where the run read them. undistort: whether images become those
+        of a pinhole; None: where the lens is bent. all_poses: interpolated poses too, not only measured ones.
+        Raises ConfigError for a format or an option that is not known, InputError for one that the run has nothing for,
+        and OutputError.
         """
         out = Path(out).expanduser()
-        if kind in SPLAT_FORMATS:
-            return export_splat(self.path, kind, out)
-        return export_run(self.path, kind, out)
+        _check_export(kind, source, undistort, all_poses)
+        if kind in SPLATS:
+            return export_splat(self._run, kind, out, all_poses=all_poses)
+        if kind in TRAJECTORIES:
+            return export_trajectory(self._run, kind, out, all_poses=all_poses)
+        path = self._photographs(source)
+        opened = open_source(path, self.config.source, want_semantic=False)
+        if kind == "plates":
+            return export_plates(self._run, out, opened, path, all_poses=all_poses)
+        return export_pictures(self._run, kind, out, opened, path, undistort=undistort, all_poses=all_poses)
+
+
+def _check_export(kind: str, source: str | Path | None, undistort: bool | None, all_poses: bool) -> None:
+    """Raise ConfigError for an option that the format does not have."""
+    if kind not in KINDS:
+        raise ConfigError(f"export: expected one of {', '.join(KINDS)}, got {kind!r}")
+    said = {
+        "source": (source is not None, PICTURES),
+        "undistort": (undistort is not None, UNDISTORTING),
+        "all-poses": (all_poses, (*TRAJECTORIES, *PICTURES, "depth")),
+    }
+    for option, (given, kinds) in said.items():
+        if given and kind not in kinds:
+            raise ConfigError(f"export --{option}: expected --to {', '.join(kinds)}, got --to {kind}")

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from ..camera.map_view import MapView
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
-from ..config import HOLDOUT_EVERY, Config, config_from_dict
+from ..config import Config, config_from_dict
 from ..errors import InputError
-from ..export.files import writing
-from ..export.read_run import Run, read_run
+from ..export.export_folder import export_folder
+from ..export.files import replacing, writing
+from ..export.formats import exported_poses
+from ..export.read_run import Run
 from ..export.run_folder import write_depth_png
 from ..export.video import write_video
 from ..geometry.path import smoothed_path
@@ -71,34 +73,37 @@ def flight_camera(full: Camera | OpenCvLens) -> Camera:
     return full.pinhole.resized(width, max(2, round(full.height * width / full.width)))
 
 
-def export_splat(run_dir: Path, kind: str, out: Path) -> Path:
-    """``mastd3r export --to spz|flight|depth``: the splat of a run folder; gives the path written.
+def export_splat(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> Path:
+    """``mastd3r export --to spz|flight|depth``: the splat of a run; gives the path written.
 
-    spz: a file. flight: an .mp4. depth: a folder of 16-bit images at the poses of the holdout frames, as ``depth/`` of
-    the run folder is. Raises InputError for a run without a map, OutputError where ``out`` cannot be written.
+    spz: a file. flight: an .mp4. depth: a folder of 16-bit images <timestamp>.png of every pose that was measured, and
+    with ``all_poses`` of the interpolated ones; its export.json says ``depth_png_per_unit``, steps a map unit.
+    Raises InputError for a run without a map, OutputError where ``out`` cannot be written; it is whole or not there.
     """
-    run = read_run(run_dir)
-    gaussians = read_gaussians_ply(run_dir / "gaussians.ply")
-    with writing(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
+    gaussians = read_gaussians_ply(run.path / "gaussians.ply")
     if kind == "spz":
-        write_gaussians_spz(out, gaussians)
+        with writing(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(out) as part:
+            write_gaussians_spz(part, gaussians)
         return out
-    lens, facts = lens_of(run), _facts(run)
-    splat = Splat(gaussians, NEAR_RATIO * facts["median_depth"])
+    lens, median_depth = lens_of(run), map_facts(run)["median_depth"]
+    splat = Splat(gaussians, NEAR_RATIO * median_depth)
     if kind == "flight":
+        with writing(out):
+            out.parent.mkdir(parents=True, exist_ok=True)
         poses = flight_path(run.trajectory.timestamps_s, run.trajectory.world_from_cam)
-        write_flight(out, splat.render, flight_camera(lens), poses)
+        with replacing(out, out.suffix) as part:
+            write_flight(part, splat.render, flight_camera(lens), poses)
         return out
-    with writing(out):
-        out.mkdir(exist_ok=True)
+    trajectory, per_unit = exported_poses(run, all_poses), depth_png_per_unit(median_depth)
     mapping = (config_from_dict(yaml.safe_load(run.config) or {}) if run.config else Config()).mapping
     map_view = MapView(lens, mapping.width_px, mapping.tau_uncertainty_px)
-    times_s, per_unit = run.trajectory.timestamps_s, depth_png_per_unit(facts["median_depth"])
-    for time_s, pose in list(zip(times_s, run.trajectory.world_from_cam, strict=True))[::HOLDOUT_EVERY]:
-        if np.isfinite(pose).all():
+    facts = {"kind": kind, "run": str(run.path.resolve()), "depth_png_per_unit": per_unit}
+    with export_folder(out, facts, []) as staged:
+        for time_s, pose in zip(trajectory.timestamps_s, trajectory.world_from_cam, strict=True):
             depth = splat.render(pose, map_view.pinhole)[1]
-            write_depth_png(out, float(time_s), map_view.depth_as_photograph(depth), per_unit)
+            write_depth_png(staged, float(time_s), map_view.depth_as_photograph(depth), per_unit)
     return out
 
 
@@ -112,7 +117,8 @@ def lens_of(run: Run) -> Camera | OpenCvLens:
     return OpenCvLens(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height, run.distortion)
 
 
-def _facts(run: Run) -> dict[str, Any]:
+def map_facts(run: Run) -> dict[str, Any]:
+    """What run.json says of the map. Raises InputError where there is none."""
     facts = run.record.get("map")
     if not isinstance(facts, dict) or "median_depth" not in facts:
         raise InputError(f"{run.path}/run.json: expected what was written of the map (key map), got none")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,32 +17,34 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class PlacedPoints:
+    """The points of one keyframe in the world."""
+
+    points_world: Array  # (p, 3)
+    depth: Array  # (p,) along the keyframe's axis
+    own_confidence: Array  # (p,) 0..1, how well the pixel's own depth is known
+    confidence: Array  # (p,) 0..1, also where the depth is that of the neighbours
+    keep: Array  # (p,) bool: it stands still, and something supports it
+
+
 def static_cloud(graph: KeyframeGraph, colors: dict[int, Array], moving: dict[int, Array]) -> StaticCloud:
     """Fused static points of the keyframes in ``colors``: (p, 3) uint8 at each keyframe's px; ``moving`` (p,).
 
     Moving points and points without support are pruned. A pixel whose own depth is unsure stands at its
     neighbours' depth, with the confidence halved.
     """
-    camera = graph.camera()
     parts = []
     for k, color in colors.items():
-        v, kf = graph.variables[k], graph.keyframes[k]
-        info = graph.depth_info(k)
-        own = depth_confidence(v.inv_depth, info)
-        inv_depth = inpainted(v.inv_depth, info, kf.work.grid)
-        support = inpainted(np.maximum(own, 1e-3), np.full(len(own), 1e12), kf.work.grid)
-        confidence = np.where(own > 0.5, own, 0.5 * support) * (1 - moving[k])
-        keep = (confidence > 0.05) & (moving[k] < 0.5) & (inv_depth > 0.02 * np.median(inv_depth))
-        depth = 1 / np.maximum(inv_depth, 1e-9)
-        points_cam = camera.rays(v.px) * depth[:, None]
-        pose = graph.world_from_cam(k)
-        cell = graph.size[0] / kf.work.grid[1]
+        placed = placed_points(graph, k, moving[k])
+        keep = placed.keep
+        cell = graph.size[0] / graph.keyframes[k].work.grid[1]
         parts.append(
             (
-                (points_cam @ pose[:3, :3].T + pose[:3, 3])[keep],
+                placed.points_world[keep],
                 color[keep],
-                confidence[keep],
-                (depth * cell / camera.fx_px)[keep],
+                placed.confidence[keep],
+                (placed.depth * cell / graph.camera().fx_px)[keep],
                 np.full(int(keep.sum()), k),
             )
         )
@@ -55,6 +58,21 @@ def static_cloud(graph: KeyframeGraph, colors: dict[int, Array], moving: dict[in
         spacing.astype(np.float32),
         kf_id.astype(np.int32),
     )
+
+
+def placed_points(graph: KeyframeGraph, kf_id: int, moving: Array) -> PlacedPoints:
+    """The points of a keyframe's px, ``moving`` (p,) P(moving) of each."""
+    v, grid = graph.variables[kf_id], graph.keyframes[kf_id].work.grid
+    info = graph.depth_info(kf_id)
+    own = depth_confidence(v.inv_depth, info)
+    inv_depth = inpainted(v.inv_depth, info, grid)
+    support = inpainted(np.maximum(own, 1e-3), np.full(len(own), 1e12), grid)
+    confidence = np.where(own > 0.5, own, 0.5 * support) * (1 - moving)
+    keep = (confidence > 0.05) & (moving < 0.5) & (inv_depth > 0.02 * np.median(inv_depth))
+    depth = 1 / np.maximum(inv_depth, 1e-9)
+    points_cam = graph.camera().rays(v.px) * depth[:, None]
+    pose = graph.world_from_cam(kf_id)
+    return PlacedPoints(points_cam @ pose[:3, :3].T + pose[:3, 3], depth, own, confidence, keep)
 
 
 def _no_points() -> tuple[Array, Array, Array]:

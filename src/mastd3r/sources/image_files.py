@@ -16,6 +16,7 @@ from .grey_levels import TOP, WHOLE, GreyRange
 
 Array = NDArray[Any]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+EXIF_ORIENTATION, UPRIGHT = 0x0112, 1
 MAP_SUFFIXES = (".png", ".npy")
 BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 
@@ -33,6 +34,15 @@ def read_rgb(path: Path, grey_range: GreyRange = WHOLE) -> Array:
     if image.mode.startswith("I"):  # Pillow's modes of 16-bit grey files
         image = Image.fromarray(grey_range.as_8_bit(_grey_levels(image, path)))
     return np.array(image.convert("RGB"))  # a copy of its own, writable
+
+
+def stored_as_read(path: Path) -> bool:
+    """True where ``read_rgb`` changes nothing: 8-bit colour or grey, stored upright. Raises InputError."""
+    try:
+        with Image.open(path) as image:
+            return image.mode in ("L", "RGB") and image.getexif().get(EXIF_ORIENTATION, UPRIGHT) == UPRIGHT
+    except BROKEN as e:
+        raise BrokenFile(f"{path}: expected a readable image, got a broken or unknown file ({e})") from e
 
 
 def read_grey_levels(path: Path) -> Array | None:

@@ -60,7 +60,8 @@ class ImageFolderSource:
             raise InputError(f"{folder}: expected images ({', '.join(IMAGE_SUFFIXES)}), got none")
         self._chosen = window(config, len(self._files), str(folder))
         self.length: int | None = len(self._chosen)
-        self._photographs = Photographs({i: self._files[i] for i in self._chosen}, self._notes)
+        self.files = {i: self._files[i] for i in self._chosen}
+        self._photographs = Photographs(self.files, self._notes)
         self.size = self._photographs.size
         self._describe()
         self.focal_hint_px, self.focal_source = focal_of([self._files[i] for i in self._chosen], self.size)

@@ -76,7 +76,8 @@ class SequenceSource:
         check_times([found.frames[i].timestamp_s for i in self._chosen], found.name)
         for i in self._chosen:
             _check_there(found.frames[i].image, "an image")
-        self._photographs = Photographs({i: found.frames[i].image for i in self._chosen}, self._notes)
+        self.files = {i: found.frames[i].image for i in self._chosen}
+        self._photographs = Photographs(self.files, self._notes)
         self.size = self._photographs.size
         self.calibration = calibration_for(self.size, found.lens_size, found.calibration, self._notes)
         self.has_depth = any(found.frames[i].depth is not None for i in self._chosen)

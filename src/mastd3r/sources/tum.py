@@ -78,7 +78,8 @@ class TumSource:
             if not self._image(i).is_file():
                 row = self._rows[i]
                 raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
-        self._photographs = Photographs({i: self._image(i) for i in self._chosen}, self._notes)
+        self.files = {i: self._image(i) for i in self._chosen}
+        self._photographs = Photographs(self.files, self._notes)
         self.size = self._photographs.size
         self.calibration = self._intrinsics() or calibration_for(self.size, lens_size, published, self._notes)
         self._depth = self._associated("depth.txt")
