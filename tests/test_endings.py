@@ -199,6 +199,14 @@ def test_want_of_memory_is_said(
     assert record_of(out)["status"] == "incomplete"
 
 
+def test_a_path_is_never_read_as_markup(room_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "[/x] run [bold]"
+    assert main(["run", str(room_clip), "--out", str(out), "--no-map", "--quiet", "--end", "12"]) == 0
+    assert str(out / "report.html") in capfd.readouterr().out
+    assert main(["export", str(out), "--to", "tum", "--out", str(tmp_path / "[/b].txt")]) == 0
+    assert "[/b].txt" in capfd.readouterr().out
+
+
 def test_complete_is_the_very_last_write(room_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is written after the line that says so."""
     written: list[str] = []

@@ -52,7 +52,7 @@ def _bench(args: argparse.Namespace, console: Console) -> int:
     _run(todo, len(chosen), folders, store, allowed, console)
     written = _write(suite, sequences, folders, args, store)
     _say_what_is_missing(written, console)
-    Console().print(f"wrote {store.out / 'table.md'} and {store.out / 'table.html'}", soft_wrap=True)
+    Console().print(f"wrote {store.out / 'table.md'} and {store.out / 'table.html'}", soft_wrap=True, markup=False)
     if not folders:
         raise InputError(f"--data {args.data}: expected sequences of {suite.name}, got none; see {store.out}/table.md")
     return 0

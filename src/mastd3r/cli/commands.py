@@ -104,7 +104,7 @@ def _table(metrics: dict[str, Any]) -> Table:
 
     table = Table(show_header=False)
     for key, value in in_order(metrics):
-        table.add_row(described(key), shown(key, value))
+        table.add_row(described(key), Text(shown(key, value)))
     return table
 
 
@@ -182,7 +182,7 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
 
     table = Table(show_header=False)
     for key, value in machine_info().items():
-        table.add_row(key, str(value))
+        table.add_row(key, Text(str(value)))
     Console().print(table)
     for registry in REGISTRIES:
         parts = "; ".join(f"{e.name} ({e.summary})" for e in registry.entries())

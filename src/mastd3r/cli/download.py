@@ -49,7 +49,9 @@ def _download(args: argparse.Namespace, console: Console) -> int:
         out.print(f"{word}: {one.path}", highlight=False, soft_wrap=True, markup=False)
     for file in kept_archives(dataset, args.to):
         size = human_bytes(file.stat().st_size)
-        console.print(f"kept, other sequences come out of it: {file} ({size})", highlight=False, soft_wrap=True)
+        console.print(
+            f"kept, other sequences come out of it: {file} ({size})", highlight=False, soft_wrap=True, markup=False
+        )
     return 0
 
 

@@ -48,7 +48,9 @@ def _list(args: argparse.Namespace, console: Console) -> int:
         table.add_row(entry.name, STATE_SHOWN[entry.state], size, entry.licence, entry.what)
     out = Console()
     out.print(table)
-    out.print(f"They lie in {home() / 'weights'}; MASTD3R_HOME moves them.", highlight=False, soft_wrap=True)
+    out.print(
+        f"They lie in {home() / 'weights'}; MASTD3R_HOME moves them.", highlight=False, soft_wrap=True, markup=False
+    )
     return 0
 
 
@@ -62,7 +64,7 @@ def _download(args: argparse.Namespace, console: Console) -> int:
         got = download(args.what, _accept(args.yes, console), as_name=args.as_name, watch=bars.watch)
     if (got if got.is_dir() else got.parent).name not in KNOWN:
         console.print("The licence of these weights is not known here: see the page that they come from.")
-    Console().print(f"ready: {got}", highlight=False, soft_wrap=True)
+    Console().print(f"ready: {got}", highlight=False, soft_wrap=True, markup=False)
     return 0
 
 
