@@ -91,6 +91,24 @@ def test_signals_at_any_moment(name: str, realtime: bool, room_clip: Path, tmp_p
         ended_by(name, process, out)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no file locks of this kind")
+def test_a_folder_that_a_run_is_writing_in_is_refused(
+    room_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    process = start_run(room_clip, out, "--no-map")
+    wait_for(lambda: len(list((out / "masks").glob("*.png"))) > 0, process)
+    before = (out / "trajectory.txt").read_bytes()
+    for words in (["run", str(room_clip), "--out", str(out), "--no-map"], ["resume", str(out)]):
+        assert main([*words, "--quiet"]) == 2
+        assert "got one of a run that goes on" in capfd.readouterr().err
+    assert main(["run", str(room_clip), "--out", str(out), "--overwrite", "--quiet"]) == 2
+    assert (out / "trajectory.txt").read_bytes() == before
+    process.kill()
+    process.communicate()
+    assert main(["resume", str(out), "--quiet"]) == 0
+
+
 def test_an_ignored_signal_stays_ignored(room_clip: Path, tmp_path: Path) -> None:
     """``nohup``: the terminal may go."""
     argv = [sys.executable, "-m", "mastd3r", "run", str(room_clip), "--out", str(tmp_path / "run"), "--no-map"]

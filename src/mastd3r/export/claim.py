@@ -15,6 +15,7 @@ from typing import Any
 from ..errors import OutputError
 from .checkpoint import remove_checkpoints
 from .files import writing
+from .run_log import is_held
 
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "gaussians.ply",
@@ -53,6 +54,7 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
                 f"{folder}: expected an empty folder or an earlier run, got a folder with other files and no run.json "
                 f"of a run; {ANOTHER}"
             )
+        check_not_in_use(folder)
         settle(folder)
         _remove_run(unfinished)
         if (folder / "trajectory.txt").is_file() and not overwrite:
@@ -115,6 +117,13 @@ def stopped_run(folder: Path) -> Path | None:
         if record is not None:
             return None if record["status"] == "complete" else path
     return None
+
+
+def check_not_in_use(folder: Path) -> None:
+    """Raise OutputError where a process that is alive writes a run in this folder."""
+    for path in (folder, folder / UNFINISHED):
+        if is_held(path / "run.log"):
+            raise OutputError(f"{path}: expected a folder that no run is writing in, got one of a run that goes on")
 
 
 def check_ours(folder: Path) -> None:

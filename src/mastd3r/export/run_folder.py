@@ -19,7 +19,7 @@ from ..camera.pinhole import Camera
 from ..concurrency import undivided
 from ..errors import OutputError, SlamError, reason_of
 from ..types import StaticCloud, Trajectory
-from .claim import FOLDERS, RESERVE, UNFINISHED, check_ours, claim, settle
+from .claim import FOLDERS, RESERVE, UNFINISHED, check_not_in_use, check_ours, claim, settle
 from .files import write_bytes, write_json, write_text, writing
 from .machine import machine_info
 from .point_cloud import write_cloud
@@ -84,6 +84,7 @@ class RunFolder:
     def going_on(cls, path: Path, record: dict[str, Any]) -> RunFolder:
         """The folder of a run that was stopped, and is running again. Raises OutputError."""
         check_ours(path)
+        check_not_in_use(path)
         folder = cls.again(path, record)
         folder.home = path.parent if path.name == UNFINISHED else path
         for name in FOLDERS:

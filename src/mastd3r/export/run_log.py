@@ -22,11 +22,45 @@ class _Handler(logging.FileHandler):
         """Say nothing."""
 
 
+def _locked(path: Path) -> Any:
+    """The file at ``path``, open and locked; None where another one holds it, or locks are not to be had."""
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        return None
+    try:
+        file = open(path, "ab")  # noqa: SIM115  it is kept open
+    except OSError:
+        return None
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.close()
+        return None
+    return file
+
+
+def is_held(path: Path) -> bool:
+    """Whether a process that is alive writes this log."""
+    try:
+        import fcntl
+
+        with open(path, "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except (ImportError, OSError):
+        return False
+    return False
+
+
 class RunLog:
     """Takes what the package logs from ``open`` to ``close``, at the level that the application has chosen."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self._handler = path, None  # type: Path, logging.Handler | None
+        self.path = path
+        self._handler: logging.Handler | None = None
+        self._held: Any = None  # the open file whose lock says that a process writes here
 
     def begin(self, record: Mapping[str, Any]) -> None:
         """The first lines: what was asked for, where."""
@@ -34,8 +68,9 @@ class RunLog:
         self._write("".join(f"{line}\n" for line in words))
 
     def open(self) -> None:
-        """From now on."""
+        """From now on; until ``close``, or the end of the process however it comes, ``is_held`` is true of the file."""
         if self._handler is None:
+            self._held = _locked(self.path)
             self._handler = _Handler(self.path, encoding="utf-8", errors="backslashreplace", delay=True)
             self._handler.setFormatter(logging.Formatter(FORMAT))
             logging.getLogger(PACKAGE).addHandler(self._handler)
@@ -54,7 +89,9 @@ class RunLog:
             logging.getLogger(PACKAGE).removeHandler(self._handler)
             with suppress(OSError):
                 self._handler.close()
-            self._handler = None
+                if self._held is not None:
+                    self._held.close()
+            self._handler = self._held = None
 
     def _write(self, text: str) -> None:
         with suppress(OSError), open(self.path, "a", encoding="utf-8", errors="backslashreplace") as file:
