@@ -75,6 +75,7 @@ def test_a_signal_ends_a_run_as_ctrl_c_does(name: str, room_clip: Path, tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("realtime", [False, True], ids=["offline", "realtime"])
 @pytest.mark.parametrize("name", ENDS)
 def test_signals_at_any_moment(name: str, realtime: bool, room_clip: Path, tmp_path: Path) -> None:

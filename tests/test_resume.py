@@ -270,6 +270,7 @@ def test_a_source_that_has_gone_is_one_line(room_clip: Path, tmp_path: Path, cap
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_killed_at_twenty_random_moments(room_clip: Path, tmp_path: Path) -> None:
     """With the map, at the interval that users have."""
     words = ["run", str(room_clip), "--quiet", "--set", "mapping.iterations=200", "--out"]
