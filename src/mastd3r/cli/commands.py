@@ -128,8 +128,11 @@ def evaluate_run(args: argparse.Namespace, console: Console) -> int:
 def export(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r export``."""
     from ..pipeline import load
+    from ..progress import Silent
+    from .terminal import Terminal
 
-    written = load(args.run).export(args.to, args.out)
+    reporter = Silent() if args.quiet else Terminal(console)
+    written = load(args.run).export(args.to, args.out, source=args.source, reporter=reporter)
     Console().print(f"wrote {written}", soft_wrap=True)
     return 0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NoReturn, get_args
 
 from .. import __version__
-from ..config import PRESETS, Config, MapLossKind, MapQualityKind, SourceKind
+from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
@@ -21,6 +21,11 @@ QUALITY_HELP = (
     f"(default {Config().mapping.quality})"
 )
 MINUTES_HELP = "train the map for so long, instead of for the number of steps of its quality (the default)"
+
+
+EXPORTS = ("tum", "kitti", "colmap", "spz", "flight", "depth", "cloud", "mesh")
+OUT_HELP = "file (tum, kitti, spz; flight: .mp4; cloud: .ply; mesh: .ply or .glb) or folder (colmap, depth)"
+CLOUD_HELP = f"dense: depth of every keyframe pixel too, as cloud_dense.ply (default {Config().cloud})"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -42,14 +47,12 @@ def parser() -> argparse.ArgumentParser:
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
-    export = known.add_parser("export", help="write a run's trajectory or splat in another format")
+    export = known.add_parser("export", help="write a run's trajectory, splat, dense cloud or mesh")
     export.add_argument("run", type=Path, help="run folder")
-    export.add_argument(
-        "--to", choices=("tum", "kitti", "colmap", "spz", "flight", "depth"), required=True, help="the format"
-    )
-    export.add_argument(
-        "--out", type=Path, required=True, help="file (tum, kitti, spz, flight: .mp4) or folder (colmap, depth)"
-    )
+    export.add_argument("--to", choices=EXPORTS, required=True, help="the format")
+    export.add_argument("--out", type=Path, required=True, help=OUT_HELP)
+    export.add_argument("--source", type=Path, help="cloud and mesh: where the photographs are now")
+    export.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     export.set_defaults(act=commands.export)
     view = known.add_parser("view", help="open a run's report in the browser")
     view.add_argument("run", type=Path, help="run folder")
@@ -94,6 +97,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
     p.add_argument("--map-minutes", type=float, metavar="M", help=MINUTES_HELP)
+    p.add_argument("--cloud", choices=get_args(CloudKind), help=CLOUD_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
     p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")

@@ -11,8 +11,8 @@ from ..errors import OutputError
 from .files import writing
 
 FILES = (
-    "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
+    "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "cloud_dense.ply",
+    "gaussians.ply",    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")
 RESERVE = ".reserve"

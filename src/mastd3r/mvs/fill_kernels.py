@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numba as nb
-import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]

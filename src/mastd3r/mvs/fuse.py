@@ -43,9 +43,7 @@ def fused(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
         confidence = maps.agreeing[i][keep] / max(1, len(others))
         parts.append((points @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T, view.color[keep], confidence))
     points, normals, colors, confidence = (np.concatenate(p) for p in zip(*parts, strict=True))
-    return DenseCloud(
-        points.astype(np.float32), normals.astype(np.float32), colors, confidence.astype(np.float32)
-    )
+    return DenseCloud(points.astype(np.float32), normals.astype(np.float32), colors, confidence.astype(np.float32))
 
 
 def normals_cam(inv_depth: Array, rays: Array) -> Array:

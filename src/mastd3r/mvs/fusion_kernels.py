@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numba as nb
-import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -23,7 +22,7 @@ def depth_at(inv_depth: Array, x: float, y: float) -> float:
     x0, y0 = min(int(x), w - 2), min(int(y), h - 2)
     fx, fy = x - x0, y - y0
     a, b, c, d = inv_depth[y0, x0], inv_depth[y0, x0 + 1], inv_depth[y0 + 1, x0], inv_depth[y0 + 1, x0 + 1]
-    low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
+    low, high = min(a, b, c, d), max(a, b, c, d)
     if low <= 0 or high > low * (1 + ONE_SURFACE):
         return 1.0 / nearest
     return 1.0 / ((a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy)

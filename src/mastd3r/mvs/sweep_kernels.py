@@ -51,7 +51,7 @@ def plane_cost(ref_mean: Array, ref_var: Array, sums: Array, valid: Array, noise
 
 
 @nb.njit(inline="always", **_JIT)
-def _step(cost: Array, before: Array, low: float, p1: float, p2: float, now: Array, total: Array) -> float:
+def _step(cost: Array, before: Array, low: float, p1: float, p2: float, now: Array, total: Array) -> Any:
     """One pixel of one path, Hirschmueller (PAMI 2008) eq. (13); adds to ``total`` and gives the path's minimum."""
     count = cost.shape[0]
     least = np.float32(1e9)

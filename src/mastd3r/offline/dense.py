@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.map_view import MapView
-from ..errors import InputError
+from ..errors import ConfigError, InputError
 from ..export.dense_files import write_dense_cloud
+from ..export.files import writing
 from ..export.point_cloud import read_cloud
 from ..export.read_run import Run
 from ..export.run_folder import stamp
@@ -28,6 +29,7 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 WIDTH_PX = 640  # of the images that depth is found in, never enlarged
 MOVING = 0.5  # P(moving) above which a pixel is left out
+DENSE_FORMATS = ("cloud", "mesh")
 CLOUD_FILE = "cloud_dense.ply"
 
 
@@ -72,7 +74,7 @@ def stereo_views(run: Run, source: Source) -> list[StereoView]:
 
 
 def densified(run: Run, source: Source, reporter: Reporter) -> Dense:
-    """Depth maps of the keyframes. Raises InputError as ``stereo_views``, and for a run without a cloud to start from."""
+    """Depth maps of the keyframes. Raises InputError as ``stereo_views``, and for a run without a cloud."""
     began = time.perf_counter()
     points = read_cloud(run.path / "cloud.ply").points_world
     views = stereo_views(run, source)
@@ -90,6 +92,12 @@ def densified(run: Run, source: Source, reporter: Reporter) -> Dense:
     return Dense(views, maps, facts)
 
 
+def write_dense_cloud_of(run: Run, source: Source, reporter: Reporter) -> dict[str, Any]:
+    """cloud_dense.ply of a run folder; gives what run.json says of it. Raises as ``densified`` and OutputError."""
+    dense = densified(run, source, reporter)
+    return {**dense.facts, "points": write_dense(dense, run.path / CLOUD_FILE)}
+
+
 def write_dense(dense: Dense, out: Path) -> int:
     """The fused cloud as a PLY; gives the number of points. Raises OutputError."""
     cloud = fused(dense.views, dense.maps)
@@ -99,3 +107,17 @@ def write_dense(dense: Dense, out: Path) -> int:
         len(cloud.points_world), 100 * dense.facts["covered_ratio"], len(dense.views),
     )  # fmt: skip
     return len(cloud.points_world)
+
+
+def export_dense(run: Run, source: Source, kind: str, out: Path, reporter: Reporter) -> Path:
+    """``mastd3r export --to cloud``; gives the path written.
+
+    Raises ConfigError for a name that is not .ply, InputError as ``densified``, OutputError where ``out`` cannot be
+    written.
+    """
+    if out.suffix.lower() != ".ply":
+        raise ConfigError(f"export --to {kind}: expected a file name that ends in .ply, got {out}")
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+    write_dense(densified(run, source, reporter), out)
+    return out

@@ -18,11 +18,12 @@ from ..camera.pinhole import Camera
 from ..concurrency import one_blas_thread
 from ..config import Config, MapQualityKind, config_from_dict
 from ..errors import ConfigError, InputError
+from ..evaluation.cloud_error import evaluate_cloud
 from ..evaluation.evaluate import evaluate
 from ..export.claim import claim
 from ..export.files import write_json, writing
 from ..export.formats import export_run
-from ..export.point_cloud import read_cloud
+from ..export.point_cloud import read_cloud, read_points
 from ..export.read_run import Run, read_run
 from ..export.run_folder import RunFolder
 from ..mapping.gaussians import GaussianArrays
@@ -31,6 +32,7 @@ from ..progress import Reporter, Silent
 from ..sources import open_source
 from ..types import StaticCloud
 from .continued_map import continue_map
+from .dense import CLOUD_FILE, DENSE_FORMATS, export_dense
 from .renders import export_splat, lens_of
 from .run_report import write_run_report
 
@@ -166,9 +168,20 @@ class Reconstruction:
         """
         source = open_source(sequence, self.config.source)
         metrics = {**self.metrics, **evaluate(self.path, source.truth(), source.frames()).metrics}
+        metrics |= self._cloud_error(sequence)
         write_json(self.path / "metrics.json", metrics)
         self._run = read_run(self.path)
         return metrics
+
+    def _cloud_error(self, sequence: str | Path) -> dict[str, Any]:
+        """How far the cloud, the dense one where there is one, is from what a sequence's depth sensor saw."""
+        file = next((f for f in (self.path / CLOUD_FILE, self.path / "cloud.ply") if f.is_file()), None)
+        lens = self._run.camera
+        source = open_source(sequence, self.config.source, want_depth=True)
+        if file is None or lens is None or not source.has_depth:
+            return {}
+        points = read_points(file)
+        return evaluate_cloud(points, self._run.trajectory, source.truth(), source.frames(), lens)
 
     @one_blas_thread()
     def train_map(
@@ -222,12 +235,21 @@ class Reconstruction:
         self._run, self._temporary = read_run(target), None
         return target
 
-    def export(self, kind: str, out: str | Path) -> Path:
-        """The run in another format, as ``mastd3r export --to``: tum, kitti, colmap, spz, flight or depth.
+    @one_blas_thread()
+    def export(
+        self, kind: str, out: str | Path, *, source: str | Path | None = None, reporter: Reporter | None = None
+    ) -> Path:
+        """The run in another format, as ``mastd3r export --to``: tum, kitti, colmap, spz, flight, depth, cloud or mesh.
 
-        Raises InputError for a format that is not known or that the run has nothing for, and OutputError.
+        cloud and mesh read the keyframes again, from ``source`` if they are no longer where the run read them.
+        Raises ConfigError for a format that is not known, InputError for one that the run has nothing for, OutputError.
         """
         out = Path(out).expanduser()
+        if kind in DENSE_FORMATS:
+            opened = open_source(self._photographs(source), self.config.source, want_semantic=False)
+            return export_dense(self._run, opened, kind, out, reporter or Silent())
+        if source is not None:
+            raise ConfigError(f"export --source: expected --to {' or '.join(DENSE_FORMATS)}, got {kind}")
         if kind in SPLAT_FORMATS:
             return export_splat(self.path, kind, out)
         return export_run(self.path, kind, out)
