@@ -24,6 +24,7 @@ SHRINK = 2  # the sweep's images are so many times smaller
 TOLERANCE = 0.015  # relative difference of depth up to which two views agree
 REACH_PX = 1.5  # and so near to where it came from a pixel must come back
 AGREEING = 2  # other views that must agree, of swept depth and of the final one
+CONTRAST_PX, CONTRAST_LEVELS = 5, 6.0  # a window with this 1-sigma of grey levels counts half
 SURE_COST = 0.5  # matching cost above which swept depth says nothing
 
 
@@ -70,14 +71,22 @@ def dense_depth(views: list[StereoView], points_world: Array, advance: Callable[
 
     def whole(i: int) -> Array:
         view = views[i]
-        known = (count[i] >= AGREEING) & (found[i][1] < SURE_COST)
+        known = contrast(images[i].gray) * ((count[i] >= AGREEING) & (found[i][1] < SURE_COST))
         size = (view.camera.width, view.camera.height)
-        large = cv2.resize(np.where(known, merged[i], 0), size, interpolation=cv2.INTER_NEAREST)
-        return np.where(view.static, filled(large, large > 0, view.color), 0)
+        large, weight = (cv2.resize(a, size, interpolation=cv2.INTER_NEAREST) for a in (merged[i], known))
+        return np.where(view.static, filled(large, weight, view.color), 0)
 
     inv_depth = np.stack(on_two_threads(whole, range(len(views))))
     camera = views[0].camera
     return DepthMaps(inv_depth, *agreed(inv_depth, camera, poses, near, REACH_PX), camera, poses, tuple(near))
+
+
+def contrast(gray: Array) -> Array:
+    """(h, w) float32 0..1: how much of a window of the image (h, w) float32 is more than noise."""
+    window = (CONTRAST_PX, CONTRAST_PX)
+    mean = cv2.blur(gray, window)
+    variance = np.maximum(cv2.blur(gray * gray, window) - mean * mean, 0)
+    return np.asarray(variance / (variance + CONTRAST_LEVELS**2))
 
 
 def agreed(

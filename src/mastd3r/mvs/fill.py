@@ -22,21 +22,21 @@ SWEEPS, OVER = 24, 1.7
 
 
 def filled(inv_depth: Array, known: Array, color: Array) -> Array:
-    """(h, w) float32: the membrane through the known pixels (h, w) bool over a colour image (h, w, 3) uint8.
+    """(h, w) float32: the membrane through pixels known to the degree (h, w) 0..1, over (h, w, 3) uint8 colours.
 
     Known pixels are smoothed a little with their like. All 0 where nothing is known.
     """
-    if not known.any():
+    if not (known > 0).any():
         return np.zeros_like(inv_depth)
     value: Array | None = None
     for level in reversed(range(LEVELS)):
         h, w = (max(1, n >> level) for n in inv_depth.shape)
         size = (w, h)
         weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        data = cv2.resize(np.where(known, inv_depth, 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        data /= np.maximum(weight, 1e-6)
+        data = cv2.resize((known * inv_depth).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        data /= np.maximum(weight, 1e-9)
         if value is None:
-            value = np.full((h, w), np.median(inv_depth[known]), np.float32)
+            value = np.full((h, w), np.median(inv_depth[known > 0]), np.float32)
         else:
             value = cv2.resize(value, size, interpolation=cv2.INTER_LINEAR)
         image = cv2.resize(color, size, interpolation=cv2.INTER_AREA).astype(np.float32)

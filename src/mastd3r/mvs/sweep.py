@@ -20,9 +20,9 @@ from .views import Neighbourhood, StereoView
 Array = NDArray[Any]
 PLANES = (32, 128)  # least and most
 STEP_PX = 1.0  # how far the source pixel moves from one plane to the next
-WINDOW_PX = 5
-NOISE_LEVELS = 2.0  # 1-sigma of grey levels that is noise
-P1, P2 = 0.04, 0.6  # cost of a step of one plane, of a jump
+WINDOW_PX = 7
+NOISE_LEVELS = 1.0  # 1-sigma of grey levels that is noise
+P1, P2 = 0.1, 1.0  # cost of a step of one plane, of a jump
 EDGE_LEVELS = 12.0  # a step of the grey level by so much halves the cost of a jump
 
 

@@ -15,11 +15,13 @@ from ..camera.map_view import MapView
 from ..errors import ConfigError, InputError
 from ..export.dense_files import write_dense_cloud
 from ..export.files import writing
+from ..export.mesh_files import write_mesh
 from ..export.point_cloud import read_cloud
 from ..export.read_run import Run
 from ..export.run_folder import stamp
 from ..mvs.depth_maps import DepthMaps, dense_depth
 from ..mvs.fuse import fused
+from ..mvs.mesh import meshed
 from ..mvs.views import StereoView
 from ..progress import Reporter
 from ..types import Source
@@ -110,14 +112,23 @@ def write_dense(dense: Dense, out: Path) -> int:
 
 
 def export_dense(run: Run, source: Source, kind: str, out: Path, reporter: Reporter) -> Path:
-    """``mastd3r export --to cloud``; gives the path written.
+    """``mastd3r export --to cloud|mesh``; gives the path written.
 
-    Raises ConfigError for a name that is not .ply, InputError as ``densified``, OutputError where ``out`` cannot be
-    written.
+    Raises ConfigError for a name with another ending than .ply, or .glb of a mesh, InputError as ``densified``,
+    OutputError where ``out`` cannot be written.
     """
-    if out.suffix.lower() != ".ply":
-        raise ConfigError(f"export --to {kind}: expected a file name that ends in .ply, got {out}")
+    endings = (".ply",) if kind == "cloud" else (".ply", ".glb")
+    if out.suffix.lower() not in endings:
+        raise ConfigError(f"export --to {kind}: expected a file name that ends in {' or '.join(endings)}, got {out}")
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
-    write_dense(densified(run, source, reporter), out)
+    dense = densified(run, source, reporter)
+    if kind == "cloud":
+        write_dense(dense, out)
+        return out
+    mesh = meshed(dense.views, dense.maps)
+    if not len(mesh.faces):
+        raise InputError(f"{run.path}: expected surfaces that several keyframes see alike, got none to make a mesh of")
+    log.info("mesh: %d triangles, voxels of %.3g map units", len(mesh.faces), mesh.voxel)
+    write_mesh(out, mesh.vertices_world, mesh.faces, mesh.colors)
     return out
