@@ -22,7 +22,7 @@ JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 
 
 def write_mesh(path: Path, vertices_world: Array, faces: Array, colors: Array) -> None:
-    """Vertices (n, 3), triangles (m, 3), colours (n, 3) uint8 RGB. The name ends in .ply or .glb. Raises OutputError."""
+    """Vertices (n, 3), triangles (m, 3), colours (n, 3) uint8 RGB, to a .ply or .glb. Raises OutputError."""
     encode = glb_bytes if path.suffix.lower() == ".glb" else ply_bytes
     write_bytes(path, encode(vertices_world, faces, colors))
 

@@ -20,10 +20,10 @@ from .views import Neighbourhood, StereoView, neighbourhoods
 
 Array = NDArray[Any]
 SOURCES = 6  # views that a view is compared with
-SHRINK = 2  # the sweep's images are so many times smaller
+SWEPT_WIDTH_PX = 320  # about the width of the images that are swept: smaller by a whole number
 TOLERANCE = 0.015  # relative difference of depth up to which two views agree
 REACH_PX = 1.5  # and so near to where it came from a pixel must come back
-AGREEING = 2  # other views that must agree, of swept depth and of the final one
+AGREEING_SWEPT, AGREEING = 2, 3  # other views that must agree, of swept depth and of the final one
 CONTRAST_PX, CONTRAST_LEVELS = 5, 6.0  # a window with this 1-sigma of grey levels counts half
 SURE_COST = 0.5  # matching cost above which swept depth says nothing
 
@@ -54,7 +54,8 @@ class DepthMaps:
 def dense_depth(views: list[StereoView], points_world: Array, advance: Callable[[], None]) -> DepthMaps:
     """Depth maps of views of one camera, whose common points (n, 3) are known; ``advance`` is called for every view."""
     near = neighbourhoods(views, points_world, SOURCES)
-    images = [sweep_image(view, SHRINK) for view in views]
+    shrink = max(1, round(views[0].camera.width / SWEPT_WIDTH_PX))
+    images = [sweep_image(view, shrink) for view in views]
 
     def swept(i: int) -> tuple[Array, Array]:
         advance()
@@ -67,11 +68,11 @@ def dense_depth(views: list[StereoView], points_world: Array, advance: Callable[
     small = views[0].camera.resized(*images[0].gray.shape[::-1])
     poses = np.stack([view.world_from_cam for view in views])
     rough = np.stack([inv_depth * (image.static > 0) for (inv_depth, _), image in zip(found, images, strict=True)])
-    count, merged = agreed(rough, small, poses, near, REACH_PX / SHRINK)
+    count, merged = agreed(rough, small, poses, near, REACH_PX / shrink)
 
     def whole(i: int) -> Array:
         view = views[i]
-        known = contrast(images[i].gray) * ((count[i] >= AGREEING) & (found[i][1] < SURE_COST))
+        known = contrast(images[i].gray) * ((count[i] >= AGREEING_SWEPT) & (found[i][1] < SURE_COST))
         size = (view.camera.width, view.camera.height)
         large, weight = (cv2.resize(a, size, interpolation=cv2.INTER_NEAREST) for a in (merged[i], known))
         return np.where(view.static, filled(large, weight, view.color), 0)

@@ -14,6 +14,7 @@ from .fusion_kernels import mark_shown
 from .views import StereoView
 
 Array = NDArray[Any]
+SPACING_PX = 2.0  # one point a voxel of so many pixels at the median depth
 NORMAL_SMOOTHING_PX = 5  # window over which inverse depth is smoothed before its slope is taken
 
 
@@ -32,18 +33,31 @@ def fused(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
     taken = np.zeros(maps.inv_depth.shape, np.uint8)
     trusted = maps.trusted
     rays = maps.camera.rays(maps.camera.pixel_grid())
+    spacing = SPACING_PX * (maps.median_depth or 1.0) / maps.camera.fx_px
     parts: list[tuple[Array, Array, Array, Array]] = []
     for i, view in enumerate(views):
         keep = trusted[i] & (taken[i] == 0)
         others, from_ref, _ = relative(maps.world_from_cam, i, maps.near[i])
         mark_shown(maps.inv_depth, i, others, pinhole(maps.camera), from_ref, TOLERANCE, keep, taken)
         pose = maps.world_from_cam[i]
-        points = rays[keep] / maps.merged[i][keep][:, None]
-        normals = normals_cam(maps.merged[i], rays)[keep]
+        points = (rays[keep] / maps.merged[i][keep][:, None]) @ pose[:3, :3].T + pose[:3, 3]
         confidence = maps.agreeing[i][keep] / max(1, len(others))
-        parts.append((points @ pose[:3, :3].T + pose[:3, 3], normals @ pose[:3, :3].T, view.color[keep], confidence))
+        rows = surest_of_voxels(points, confidence, spacing)  # of the view first: sorting all at once takes long
+        normals = normals_cam(maps.merged[i], rays)[keep][rows] @ pose[:3, :3].T
+        parts.append((points[rows], normals, view.color[keep][rows], confidence[rows]))
     points, normals, colors, confidence = (np.concatenate(p) for p in zip(*parts, strict=True))
+    rows = surest_of_voxels(points, confidence, spacing)
+    points, normals, colors, confidence = points[rows], normals[rows], colors[rows], confidence[rows]
     return DenseCloud(points.astype(np.float32), normals.astype(np.float32), colors, confidence.astype(np.float32))
+
+
+def surest_of_voxels(points: Array, confidence: Array, spacing: float) -> Array:
+    """Ascending rows of the surest of the points (n, 3) in every voxel ``spacing`` wide, the first of equals."""
+    cell = np.floor(points / spacing).astype(np.int64)
+    order = np.lexsort((-confidence, *cell.T))
+    fresh = np.ones(len(order), bool)
+    fresh[1:] = (np.diff(cell[order], axis=0) != 0).any(1)
+    return np.sort(order[fresh])
 
 
 def normals_cam(inv_depth: Array, rays: Array) -> Array:

@@ -19,11 +19,12 @@ from .views import StereoView
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
-VOXELS_A_DEPTH = 150  # of the median depth
-TRUNCATION_VOXELS = 4.0
+VOXELS_A_DEPTH = 110  # of the median depth
+TRUNCATION_VOXELS = 5.0
 FAR_RATIO = 5.0  # depth beyond so many median depths is left out
 MAX_BLOCKS = 80_000  # of 512 voxels; where more would be needed, voxels are made twice as wide
-LEAST_WEIGHT = 2.0  # agreeing views, summed over the views that see a voxel
+AGREEING = 2  # other views that must agree; one less than for the cloud, as the volume takes means
+LEAST_WEIGHT = 1.0  # agreeing views, summed over the views that see a voxel
 SMALLEST_FACES = 200  # pieces of fewer triangles are left out
 COLOR_TOLERANCE = 0.03  # relative depth up to which a view sees a vertex
 
@@ -39,10 +40,10 @@ class Mesh:
 
 
 def meshed(views: list[StereoView], maps: DepthMaps) -> Mesh:
-    """The mesh of what is trusted in the depth maps; without vertices where nothing is."""
+    """The mesh of what views see alike in the depth maps; without vertices where nothing is."""
     median = maps.median_depth
     near_enough = maps.merged * (FAR_RATIO * median) > 1
-    inv_depth = np.where(maps.trusted & near_enough, maps.merged, 0).astype(np.float32)
+    inv_depth = np.where((maps.agreeing >= AGREEING) & near_enough, maps.merged, 0).astype(np.float32)
     cam_from_world = np.stack([inverse(pose)[:3] for pose in maps.world_from_cam])
     voxel = median / VOXELS_A_DEPTH
     if not (inv_depth > 0).any():
@@ -104,9 +105,8 @@ def _keys(blocks: Array) -> Array:
 
 
 def _from_keys(keys: Array) -> Array:
-    return np.stack(
-        [keys // (4 * _HALF**2) - _HALF, keys // (2 * _HALF) % (2 * _HALF) - _HALF, keys % (2 * _HALF) - _HALF], 1
-    )
+    span = 2 * _HALF
+    return np.asarray(np.stack([keys // span**2, keys // span % span, keys % span], 1) - _HALF)
 
 
 def _around(blocks: Array) -> Array:

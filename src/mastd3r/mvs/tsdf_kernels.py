@@ -146,7 +146,7 @@ def net_faces(near: Array, value: Array, weight: Array, least: float, number: Ar
                             continue
                         whole = True
                         for n in range(4):  # the cells around the edge, in a ring
-                            p, q = -(n == 1 or n == 2), -(n >= 2)
+                            p, q = -(0 < n < 3), -(n >= 2)
                             if axis == 0:
                                 o, oi, oj, ol = _find(near, b, i, j + p, l + q)
                             elif axis == 1:
@@ -160,7 +160,7 @@ def net_faces(near: Array, value: Array, weight: Array, least: float, number: Ar
                         if not whole:
                             continue
                         if found + 1 < len(out):
-                            flip = here < 0
+                            flip = here >= 0
                             for t in range(2):
                                 a, c = quad[1 + t], quad[2 + t]
                                 out[found + t, 0] = quad[0]

@@ -24,7 +24,7 @@ from ..mvs.fuse import fused
 from ..mvs.mesh import meshed
 from ..mvs.views import StereoView
 from ..progress import Reporter
-from ..types import Source
+from ..types import Source, Trajectory
 from .renders import lens_of
 
 Array = NDArray[Any]
@@ -56,8 +56,8 @@ def stereo_views(run: Run, source: Source) -> list[StereoView]:
             f"{source.size[0]}x{source.size[1]}"
         )
     map_view = MapView(lens, WIDTH_PX, 1.0)
-    keyframes = run.trajectory.tracked().keyframes()
-    place = {stamp(float(t)): pose for t, pose in zip(keyframes.timestamps_s, keyframes.world_from_cam, strict=True)}
+    chosen = with_frames_between(run.trajectory.tracked())
+    place = {stamp(float(t)): pose for t, pose in zip(chosen.timestamps_s, chosen.world_from_cam, strict=True)}
     views: list[StereoView] = []
     for frame in source.frames():
         pose = place.pop(stamp(frame.timestamp_s), None)
@@ -73,6 +73,12 @@ def stereo_views(run: Run, source: Source) -> list[StereoView]:
             f"{min(place)} s"
         )
     return views
+
+
+def with_frames_between(tracked: Trajectory) -> Trajectory:
+    """The keyframes, and the frame halfway between each two: what a keyframe sees at its edges is seen again there."""
+    keyframes = np.flatnonzero(tracked.is_keyframe)
+    return tracked.rows(np.union1d(keyframes, (keyframes[1:] + keyframes[:-1]) // 2))
 
 
 def densified(run: Run, source: Source, reporter: Reporter) -> Dense:
