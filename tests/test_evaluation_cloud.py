@@ -18,7 +18,7 @@ def wall(step: float) -> np.ndarray:
 
 
 def test_a_wall_two_centimetres_away() -> None:
-    found = distances(wall(0.01) + [0, 0, 0.02], wall(0.01))
+    found = distances(wall(0.01) + np.array([0, 0, 0.02]), wall(0.01))
     assert found["cloud_accuracy_m"] == pytest.approx(0.02)
     assert found["cloud_completeness_rmse_m"] == pytest.approx(0.02)
     assert found["cloud_f_score_5cm"] == 1
