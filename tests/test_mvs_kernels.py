@@ -47,7 +47,7 @@ def test_plane_cost_is_the_better_half_of_normalised_correlation() -> None:
 
 def aggregate_twin(cost: Array, gray: Array, p1: float, p2: float, edge: float) -> Array:
     """All eight paths of Hirschmueller's (13), pixel by pixel."""
-    h, w, count = cost.shape
+    h, w = cost.shape[:2]
     total = np.zeros_like(cost)
     for dy, dx in ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)):
         path = np.zeros_like(cost)
