@@ -2,9 +2,9 @@
 
 usage: python benchmarks/tables.py results.json docs/results.md
 
-Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, stress.json, and in
-bench/ the results.json of each bench under its suite's name. Plots go into a folder plots beside the page, the curve
-of the stress suite beside it.
+Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
+stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a folder plots beside
+the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from mastd3r.experiments.store import read_results
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
+from dense_table import dense
 from map_tables import map_sections
 from masks_tables import masks
 from networks_table import networks
@@ -82,6 +83,7 @@ def main() -> int:
     failed = {n: e["error"] for n, e in entries.items() if "error" in e}
     lines += ["", *(f"- {name} failed: {' '.join(error)}" for name, error in failed.items())]
     lines += ["", *splats(source.parent / "splats.json")]
+    lines += dense(source.parent / "dense.json")
     lines += experiments(source.parent / "bench", target.parent / "plots")
     lines += map_sections(source.parent)
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]

@@ -41,6 +41,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
         "alignment",
         "graph",
         "mapping",
+        "mvs",
         "evaluation",
         "export",
         "networks",
@@ -72,14 +73,14 @@ HEAVY = {  # package: who may import it
     "safetensors": {"networks"},
     "gsplat": {"mapping"},
     "av": {"sources", "export"},  # reads videos, writes them
-    "numba": {"geometry", "dynamics", "mapping", "pointmap"},
+    "numba": {"geometry", "dynamics", "mapping", "pointmap", "mvs"},
     "rich": {"cli"},
 }
 # recordings are CUDA's; config: mapping.device; gsplat's backend
 NAMES_A_DEVICE = {"mapping.rasterise", "mapping.rasterise_gsplat", "networks.record", "config"}
 READS_TRUTH = {"evaluation", "sources", "types"}  # sources make it, types define it
 PASSES_TRUTH_ON = {"offline.job", "offline.reconstruction", "pipeline"}
-TRUTH_GOES_TO = {"evaluate", "score"}
+TRUTH_GOES_TO = {"evaluate", "evaluate_cloud", "score"}
 EXITS = {"cli.main", "__main__"}
 
 DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]

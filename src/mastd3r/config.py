@@ -52,6 +52,7 @@ SourceKind = Literal[
 ]  # fmt: skip
 MapDeviceKind = Literal["auto", "cpu", "cuda"]
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
+CloudKind = Literal["sparse", "dense"]
 ExecutionKind = Literal["auto", "eager", "graph", "compile"]
 
 
@@ -180,6 +181,7 @@ class Config:
     semantics: SemanticsKind = "auto"
     places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"
+    cloud: CloudKind = "sparse"  # dense: depth of every keyframe pixel too, as cloud_dense.ply; a minute or two
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     source: SourceConfig = field(default_factory=SourceConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)

@@ -158,6 +158,7 @@ class Slam:
         material = job.smooth_masks(self.masks.filter.appearance)  # III-A, forward-backward: dynamics/smoother.py;
         # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
         job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
+        job.dense_cloud()
         job.report()
         if self.recorded is not None:
             self.recorded.close()

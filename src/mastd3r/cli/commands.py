@@ -151,10 +151,12 @@ def evaluate_run(args: argparse.Namespace, console: Console) -> int:
 def export(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r export``."""
     from ..pipeline import load
+    from ..progress import Silent
+    from .terminal import Terminal
 
-    run = load(args.run)
+    reporter = Silent() if args.quiet else Terminal(console)
     options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
-    written = run.export(args.to, args.out, **options)
+    written = load(args.run).export(args.to, args.out, reporter=reporter, **options)
     Console().print(f"wrote {written}", soft_wrap=True, markup=False)
     return 0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NoReturn, get_args
 
 from .. import __version__
-from ..config import PRESETS, Config, MapLossKind, MapQualityKind, SourceKind
+from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..export.kinds import KINDS
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
@@ -23,6 +23,9 @@ QUALITY_HELP = (
 )
 OVERWRITE_HELP = "remove an earlier run in --out at once (default: it is replaced once the new one is complete)"
 MINUTES_HELP = "train the map for so long, instead of for the number of steps of its quality (the default)"
+
+
+CLOUD_HELP = f"dense: depth of every keyframe pixel too, as cloud_dense.ply (default {Config().cloud})"
 
 
 class _Parser(argparse.ArgumentParser):
@@ -83,6 +86,7 @@ def _export_parser(p: argparse.ArgumentParser) -> None:
         help="images of a pinhole, or the lens as it is (default: a pinhole where the lens is bent)",
     )
     p.add_argument("--all-poses", action="store_true", help="interpolated poses too, not only measured ones")
+    p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=commands.export)
 
 
@@ -108,6 +112,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
     p.add_argument("--map-minutes", type=float, metavar="M", help=MINUTES_HELP)
+    p.add_argument("--cloud", choices=get_args(CloudKind), help=CLOUD_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--no-loops", action="store_true", help="places that are seen again do not close the trajectory")
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)

@@ -18,8 +18,8 @@ from .files import writing
 from .run_log import is_held
 
 FILES = (
-    "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "gaussians.ply",
-    "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
+    "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "cloud_dense.ply",
+    "gaussians.ply", "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
     "tracks.npz", "run.log",
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")

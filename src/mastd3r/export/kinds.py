@@ -14,5 +14,6 @@ PICTURES = {
     "plates": "a folder with the photographs, what moves replaced by the splat",
 }
 SPLATS = {"spz": "the splat in a small file", "flight": "an .mp4", "depth": "a folder of 16-bit images, one a frame"}
+DENSE = {"cloud": "a .ply with normals, a point wherever views agree", "mesh": "triangles, .ply or .glb"}
 UNDISTORTING = ("colmap", "nerfstudio")  # write the lens with their images
-KINDS = {**TRAJECTORIES, **PICTURES, **SPLATS}
+KINDS = {**TRAJECTORIES, **PICTURES, **SPLATS, **DENSE}

@@ -66,6 +66,14 @@ def read_cloud(path: Path) -> StaticCloud:
     )
 
 
+def read_points(path: Path) -> Array:
+    """(n, 3) float32 points of any little-endian PLY of vertices. Raises InputError."""
+    rows = read_vertices(path)
+    if not set("xyz") <= set(rows.dtype.names or ()):
+        raise InputError(f"{path}: expected vertex properties x, y, z, got {rows.dtype.names}")
+    return np.stack([rows[name] for name in "xyz"], -1).astype(np.float32)
+
+
 def read_vertices(path: Path) -> Array:
     """The vertices of a little-endian PLY, (n,) structured by property name. Raises InputError."""
     try:

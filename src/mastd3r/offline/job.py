@@ -25,6 +25,7 @@ from ..export.evidence import EvidenceSample
 from ..export.frame_names import names_by_time
 from ..export.machine import peak_rss_mib
 from ..export.mask_video import MaskVideo
+from ..export.read_run import read_run
 from ..export.run_folder import RunFolder
 from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
@@ -37,6 +38,7 @@ from ..tracking.depth_prior import own_depth_spread
 from ..tracking.memory import TrackingMemory
 from ..types import Frame
 from .checkpoints import Checkpoints, JobMemory, Stage
+from .dense import write_dense_cloud_of
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from .live_map import LiveMap
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
@@ -192,6 +194,14 @@ class RunJob:
             self.timed,
             self.reporter,
         )
+
+    def dense_cloud(self) -> None:
+        """Depth of every keyframe pixel, where that is asked for."""
+        if self.config.cloud != "dense" or self._turns_only or not self.graph.started:
+            return
+        with self.timed("dense cloud"):
+            facts = write_dense_cloud_of(read_run(self.folder.path), self.source, self.reporter)
+        self.folder.update(dense=facts)
 
     def _place_frames(self, trained: TrainedMap) -> None:
         """Every frame's pose read off the finished map, so that the trajectory agrees with the splat."""

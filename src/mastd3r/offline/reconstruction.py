@@ -18,12 +18,13 @@ from ..camera.pinhole import Camera
 from ..concurrency import one_blas_thread
 from ..config import Config, MapQualityKind, config_from_dict
 from ..errors import ConfigError, InputError
+from ..evaluation.cloud_error import evaluate_cloud
 from ..evaluation.evaluate import evaluate
 from ..export.claim import claim, settle
 from ..export.files import write_json, writing
 from ..export.formats import export_trajectory
-from ..export.kinds import KINDS, PICTURES, SPLATS, TRAJECTORIES, UNDISTORTING
-from ..export.point_cloud import read_cloud
+from ..export.kinds import DENSE, KINDS, PICTURES, SPLATS, TRAJECTORIES, UNDISTORTING
+from ..export.point_cloud import read_cloud, read_points
 from ..export.read_run import Run, read_run
 from ..export.run_folder import RunFolder
 from ..mapping.gaussians import GaussianArrays
@@ -32,6 +33,7 @@ from ..progress import Reporter, Silent
 from ..sources import open_source
 from ..types import StaticCloud
 from .continued_map import continue_map
+from .dense import CLOUD_FILE, export_dense
 from .exports import export_pictures, export_plates
 from .renders import export_splat, lens_of
 from .run_report import write_run_report
@@ -167,9 +169,20 @@ class Reconstruction:
         """
         source = open_source(sequence, self.config.source)
         metrics = {**self.metrics, **evaluate(self.path, source.truth(), source.frames()).metrics}
+        metrics |= self._cloud_error(sequence)
         write_json(self.path / "metrics.json", metrics)
         self._run = read_run(self.path)
         return metrics
+
+    def _cloud_error(self, sequence: str | Path) -> dict[str, Any]:
+        """How far the cloud, the dense one where there is one, is from what a sequence's depth sensor saw."""
+        file = next((f for f in (self.path / CLOUD_FILE, self.path / "cloud.ply") if f.is_file()), None)
+        lens = self._run.camera
+        source = open_source(sequence, self.config.source, want_depth=True)
+        if file is None or lens is None or not source.has_depth:
+            return {}
+        points = read_points(file)
+        return evaluate_cloud(points, self._run.trajectory, source.truth(), source.frames(), lens)
 
     @one_blas_thread()
     def train_map(
@@ -236,6 +249,7 @@ class Reconstruction:
         source: str | Path | None = None,
         undistort: bool | None = None,
         all_poses: bool = False,
+        reporter: Reporter | None = None,
     ) -> Path:
         """The run in another format, as ``mastd3r export --to``: one of ``export.kinds.KINDS``; gives the path written.
 
@@ -252,6 +266,8 @@ class Reconstruction:
             return export_trajectory(self._run, kind, out, all_poses=all_poses)
         path = self._photographs(source)
         opened = open_source(path, self.config.source, want_semantic=False)
+        if kind in DENSE:
+            return export_dense(self._run, opened, kind, out, reporter or Silent())
         if kind == "plates":
             return export_plates(self._run, out, opened, path, all_poses=all_poses)
         return export_pictures(self._run, kind, out, opened, path, undistort=undistort, all_poses=all_poses)
@@ -262,7 +278,7 @@ def _check_export(kind: str, source: str | Path | None, undistort: bool | None, 
     if kind not in KINDS:
         raise ConfigError(f"export: expected one of {', '.join(KINDS)}, got {kind!r}")
     said = {
-        "source": (source is not None, PICTURES),
+        "source": (source is not None, (*PICTURES, *DENSE)),
         "undistort": (undistort is not None, UNDISTORTING),
         "all-poses": (all_poses, (*TRAJECTORIES, *PICTURES, "depth")),
     }
