@@ -16,9 +16,8 @@ COLUMNS = (
     "accuracy, trajectory's Sim(3)", "completeness", "accuracy, after ICP", "completeness, after ICP",
     "within 5 cm", "F-score at 5 cm",
 )  # fmt: skip
-ROWS = {
-    "sparse": "`cloud.ply`", "dense": "`cloud_dense.ply`", "mesh": "mesh", "mesh of the splat's depth": "mesh of the splat's depth",
-}  # fmt: skip
+SPLAT = "mesh of the splat's depth"
+ROWS = {"sparse": "`cloud.ply`", "dense": "`cloud_dense.ply`", "mesh": "mesh", SPLAT: SPLAT}
 
 
 def dense(path: Path) -> list[str]:
