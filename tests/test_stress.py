@@ -175,6 +175,9 @@ def cells(lines: list[str], name: str, nth: int = 0) -> list[str]:
 def test_the_table_says_what_the_entries_hold(tmp_path: Path) -> None:
     (tmp_path / "stress.json").write_text(json.dumps(ENTRIES))
     lines = stress_table.stress(tmp_path / "stress.json", tmp_path / "stress.png")
+    (missing,) = [line for line in lines if line.startswith("Not run")]
+    ran = {e["configuration"]["sequence"] for e in ENTRIES.values()}
+    assert all((name in missing) != (name in ran) for name in stress.SEQUENCES)
     # runs, base, median, worst, holds, never joined, refused, failed, focal off, in 1 sigma
     assert cells(lines, "hall (hall 0–39)") == [
         "4",
