@@ -289,7 +289,7 @@ def test_killed_at_twenty_random_moments(room_clip: Path, tmp_path: Path) -> Non
     assert command(*words, tmp_path / "compiles") == 0
     began = time.monotonic()
     assert command(*words, tmp_path / "whole") == 0
-    whole_s, draw = time.monotonic() - began, random.Random(0)
+    whole_s, draw, killed_runs = time.monotonic() - began, random.Random(0), 0
     for n in range(20):
         run = tmp_path / str(n)
         process = subprocess.Popen([sys.executable, "-m", "mastd3r", *map(str, words), str(run), "--quiet"])
@@ -298,7 +298,9 @@ def test_killed_at_twenty_random_moments(room_clip: Path, tmp_path: Path) -> Non
         time.sleep(draw.random() * 0.8 * whole_s)
         process.kill()
         process.wait()
-        assert record_of(run)["status"] == "running", "killed too late: the machine has become faster"
-        assert command("resume", run) == 0
+        if record_of(run)["status"] == "running":  # else it was faster than the one that was measured
+            killed_runs += 1
+            assert command("resume", run) == 0
         assert record_of(run)["status"] == "complete"
         assert (run / "trajectory.txt").read_bytes() == (tmp_path / "whole" / "trajectory.txt").read_bytes(), n
+    assert killed_runs >= 15
