@@ -96,12 +96,10 @@ def with_dataset_lens(config: Config, source: Source) -> tuple[Config, list[str]
 def chosen_map_device(config: MappingConfig, notes: list[str]) -> str:
     """Where the map will live; the choice and its reason go to ``notes``.
 
-    Raises InputError, see ``map_device``, and ConfigError for options of the map outside their range.
+    Raises InputError, see ``map_device``. The options have been checked, as all are where they come in.
     """
-    from .mapping.mapper import check_map_options
     from .mapping.rasterise import map_device
 
-    check_map_options(config)
     if not config.enabled:
         return "cpu"
     device, why = map_device(config.device, config.backend)

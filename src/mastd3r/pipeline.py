@@ -129,8 +129,9 @@ def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
                 done = None
             else:
                 at = f"frame {memory.job.frames}" if memory.stage == "tracking" else f"the end of: {memory.stage}"
-                folder.note(f"resumed from the checkpoint at {at}")
-                log.warning(folder.record["choices"][-1])
+                said = f"resumed from the checkpoint at {at}"
+                folder.note(said)
+                log.warning(said)
                 done = slam.go_on(memory, job)
             if done is None:
                 _track(slam, job, job.frames)

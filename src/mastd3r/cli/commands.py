@@ -22,6 +22,7 @@ from .signals import end_this_command
 
 if TYPE_CHECKING:
     from ..offline.reconstruction import Reconstruction
+    from ..progress import Reporter
 
 DEMO_SEED = 0
 DEMO_STEPS, DEMO_GAUSSIANS = 1200, 30000  # small enough for three minutes on two cores
@@ -38,26 +39,30 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def resume(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r resume``."""
     from ..pipeline import resume as go_on
-    from ..progress import Silent
-    from .terminal import Terminal
 
-    _show(go_on(args.run, reporter=Silent() if args.quiet else Terminal(console)))
+    _show(go_on(args.run, reporter=_reporter(args, console)))
     return 0
 
 
 def train_map(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r map``."""
     from ..pipeline import load
-    from ..progress import Silent
-    from .terminal import Terminal
 
     minutes = None if args.minutes is None else checked_minutes(args.minutes, "--minutes")
     run = load(args.run)
-    reporter = Silent() if args.quiet else Terminal(console)
+    reporter = _reporter(args, console)
     metrics = run.train_map(minutes, args.quality, source=args.source, reporter=reporter)
     Console().print(_table(metrics))
     _open(run.path)
     return 0
+
+
+def _reporter(args: argparse.Namespace, console: Console) -> Reporter:
+    """Bars, unless ``--quiet`` is said; ``demo`` has no such option."""
+    from ..progress import Silent
+    from .terminal import Terminal
+
+    return Silent() if getattr(args, "quiet", False) else Terminal(console)
 
 
 def _interrupt_when_stdin_closes() -> None:
@@ -70,8 +75,6 @@ def _interrupt_when_stdin_closes() -> None:
 def _run_and_show(source: Path, config: Config, args: argparse.Namespace, console: Console) -> int:
     """``args`` are those of ``run``, or of ``demo``, which has fewer."""
     from ..pipeline import reconstruct
-    from ..progress import Silent
-    from .terminal import Terminal
 
     result = reconstruct(
         source,
@@ -80,7 +83,7 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
         maps=getattr(args, "maps", None),
         overwrite=args.overwrite,
         command=args.words,
-        reporter=Silent() if getattr(args, "quiet", False) else Terminal(console),
+        reporter=_reporter(args, console),
     )
     _show(result)
     return 0
@@ -151,10 +154,8 @@ def evaluate_run(args: argparse.Namespace, console: Console) -> int:
 def export(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r export``."""
     from ..pipeline import load
-    from ..progress import Silent
-    from .terminal import Terminal
 
-    reporter = Silent() if args.quiet else Terminal(console)
+    reporter = _reporter(args, console)
     options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
     written = load(args.run).export(args.to, args.out, reporter=reporter, **options)
     Console().print(f"wrote {written}", soft_wrap=True, markup=False)

@@ -28,13 +28,13 @@ FORMAT = 1  # of the files, and of what is in them
 MAGIC = b"mastd3r checkpoint\n"
 IN_BAND_BYTES = 2048  # an array that is smaller stands in the state itself
 GARBAGE_RATIO, GARBAGE_BYTES = 2.0, 2**26  # file size over what is used, and at least so much: written anew
-OURS = {  # module of ours: classes that may be made
+PACKAGE = __name__.partition(".")[0]
+OURS: dict[str, set[str] | None] = {  # module of ours: classes that may be made
     "config": None,  # None: all that it defines
     "dynamics.config": None,
     "types": None,
     "dynamics.appearance": {"AppearanceClassifier"},
     "dynamics.filter": {"FilterMemory", "_Arrival"},
-    "dynamics.motion": {"Information"},
     "dynamics.motion_test": {"Past"},
     "features.learned": {"FeatureMemory"},
     "graph.bundle_adjustment": {"SolveReport"},
@@ -76,9 +76,9 @@ class CheckpointStore:
     def save(self, memory: Any) -> None:
         """Write a checkpoint. Raises OutputError; what was there before is then still good."""
         with writing(self.folder):
+            if self._number == 0:  # none that is good was found
+                remove_checkpoints(self.folder)
             self.folder.mkdir(exist_ok=True)
-            if self._number == 0:
-                self._begin()
         used: list[_Blob] = []
         with writing(self.folder), open(self._arrays(), "ab") as file:
             file.truncate(self._end)
@@ -118,10 +118,6 @@ class CheckpointStore:
             remove_checkpoints(self.folder)
 
     # -- writing ---------------------------------------------------------------------------------------------
-
-    def _begin(self) -> None:
-        remove_checkpoints(self.folder)
-        self.folder.mkdir(exist_ok=True)
 
     def _arrays(self) -> Path:
         return self.folder / f"arrays-{self._file}.bin"
@@ -254,14 +250,12 @@ class _Unpickler(pickle.Unpickler):
         return self._frames[at]
 
     def find_class(self, module: str, name: str) -> Any:
+        if (module, name) in OTHERS:
+            return super().find_class(module, name)
         package, _, inner = module.partition(".")
-        allowed = inner in OURS and (OURS[inner] is None or name in (OURS[inner] or ()))
-        if (package == __name__.partition(".")[0] and allowed) or (module, name) in OTHERS:
+        names = OURS.get(inner, set())
+        if package == PACKAGE and (names is None or name in names):
             found = super().find_class(module, name)
-            if (
-                package == "numpy"
-                or (isinstance(found, type) and found.__module__ == module)
-                or package == "collections"
-            ):
+            if isinstance(found, type) and found.__module__ == module:
                 return found
         raise InputError(f"expected plain data, got {module}.{name}")

@@ -7,12 +7,13 @@ from typing import Any
 import numba as nb
 from numpy.typing import NDArray
 
+from .projection import JIT, projected
+
 Array = NDArray[Any]
-_JIT: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
 ONE_SURFACE = 0.03  # relative difference of inverse depth up to which neighbouring pixels are one surface
 
 
-@nb.njit(inline="always", **_JIT)
+@nb.njit(inline="always", **JIT)
 def depth_at(inv_depth: Array, x: float, y: float) -> float:
     """Depth between pixels: of the four around where they are one surface, else of the nearest; 0 = none."""
     h, w = inv_depth.shape
@@ -28,19 +29,13 @@ def depth_at(inv_depth: Array, x: float, y: float) -> float:
     return 1.0 / ((a * (1 - fx) + b * fx) * (1 - fy) + (c * (1 - fx) + d * fx) * fy)
 
 
-@nb.njit(inline="always", **_JIT)
+@nb.njit(inline="always", **JIT)
 def _moved(m: Array, k: Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """The pixel and depth in another view, by (3, 4) ``m``, of a pixel with depth; depth 0 where it lies behind."""
-    px, py = (x - k[2]) / k[0] * z, (y - k[3]) / k[1] * z
-    qz = m[2, 0] * px + m[2, 1] * py + m[2, 2] * z + m[2, 3]
-    if qz <= 1e-6:
-        return 0.0, 0.0, 0.0
-    qx = k[0] * (m[0, 0] * px + m[0, 1] * py + m[0, 2] * z + m[0, 3]) / qz + k[2]
-    qy = k[1] * (m[1, 0] * px + m[1, 1] * py + m[1, 2] * z + m[1, 3]) / qz + k[3]
-    return qx, qy, qz
+    return projected(m, k, (x - k[2]) / k[0] * z, (y - k[3]) / k[1] * z, z)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def agreement(
     maps: Array,
     at: int,
@@ -85,7 +80,7 @@ def agreement(
             merged[v, u] = total / (n + 1)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def mark_shown(
     maps: Array, at: int, others: Array, k: Array, from_ref: Array, tolerance: float, keep: Array, taken: Array
 ) -> None:

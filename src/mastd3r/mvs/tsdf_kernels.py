@@ -12,12 +12,13 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .projection import JIT, projected
+
 Array = NDArray[Any]
-_JIT: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": True}
 SIDE = 8  # voxels along a block
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def integrate(
     first: int,
     last: int,
@@ -46,13 +47,8 @@ def integrate(
                     z = (blocks[b, 2] * SIDE + l) * voxel
                     total, by = 0.0, 0.0
                     for n in range(views):
-                        m = cam_from_world[n]
-                        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-                        if depth <= 1e-6:
-                            continue
-                        u = k[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + k[2]
-                        v = k[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + k[3]
-                        if not (-0.5 < u < w - 0.5 and -0.5 < v < h - 0.5):
+                        u, v, depth = projected(cam_from_world[n], k, x, y, z)
+                        if depth <= 0 or not (-0.5 < u < w - 0.5 and -0.5 < v < h - 0.5):
                             continue
                         row, column = int(v + 0.5), int(u + 0.5)
                         rho = maps[n, row, column]
@@ -68,14 +64,14 @@ def integrate(
                     value[b, i, j, l] = total / by if by > 0 else 1.0
 
 
-@nb.njit(inline="always", **_JIT)
+@nb.njit(inline="always", **JIT)
 def _find(near: Array, b: int, i: int, j: int, l: int) -> tuple[int, int, int, int]:
     """Block and place in it of a voxel that may lie just outside block ``b``; block -1: there is none."""
     di, dj, dl = 1 + (i >> 3), 1 + (j >> 3), 1 + (l >> 3)
     return near[b, di, dj, dl], i & 7, j & 7, l & 7
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def net_vertices(near: Array, value: Array, weight: Array, least: float, number: Array, out: Array) -> int:
     """One vertex in every cell that the surface crosses: the mean of its edges' crossings (Gibson, MICCAI 1998).
 
@@ -124,7 +120,7 @@ def net_vertices(near: Array, value: Array, weight: Array, least: float, number:
     return found
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def net_faces(near: Array, value: Array, weight: Array, least: float, number: Array, out: Array) -> int:
     """Two triangles for every voxel edge that the surface crosses, between the four cells around it.
 
@@ -169,7 +165,7 @@ def net_faces(near: Array, value: Array, weight: Array, least: float, number: Ar
     return found
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def vertex_colors(
     points: Array, maps: Array, images: Array, k: Array, cam_from_world: Array, tolerance: float, out: Array
 ) -> None:
@@ -179,13 +175,8 @@ def vertex_colors(
         x, y, z = points[p]
         total, by = np.zeros(3), 0.0
         for n in range(views):
-            m = cam_from_world[n]
-            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            if depth <= 1e-6:
-                continue
-            u = k[0] * (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / depth + k[2]
-            v = k[1] * (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / depth + k[3]
-            if not (-0.5 < u < w - 0.5 and -0.5 < v < h - 0.5):
+            u, v, depth = projected(cam_from_world[n], k, x, y, z)
+            if depth <= 0 or not (-0.5 < u < w - 0.5 and -0.5 < v < h - 0.5):
                 continue
             row, column = int(v + 0.5), int(u + 0.5)
             rho = maps[n, row, column]

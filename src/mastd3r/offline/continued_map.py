@@ -27,7 +27,6 @@ from ..export.read_run import Run
 from ..export.run_folder import RunFolder, stamp
 from ..graph.keyframe_graph import FrameRecord
 from ..mapping.gaussians import GaussianArrays
-from ..mapping.mapper import check_map_options
 from ..mapping.ply import read_gaussians_ply
 from ..mapping.process import Outcome
 from ..mapping.quality import resolved
@@ -37,6 +36,7 @@ from ..progress import Reporter
 from ..types import Source, State, StaticCloud, View
 from .final_solve import FinalFrame, trajectory_of
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
+from .photographs import check_size
 from .placement import place_frames
 from .renders import depth_png_per_unit, lens_of
 from .smoothing import is_holdout, view_positions, view_static
@@ -106,7 +106,6 @@ def options_of(
     if minutes is not None:
         changes["minutes"] = minutes
     m = config_from_dict({"mapping": changes}, config).mapping
-    check_map_options(m)
     notes: list[str] = []
     device = chosen_map_device(m, notes)
     m = resolved(m, size, device)
@@ -126,11 +125,7 @@ def rebuilt(run: Run, source: Source, config: Config) -> Rebuilt:
     Raises InputError for a source that is not the run's, and a run without poses, masks or lens.
     """
     lens = lens_of(run)
-    if source.size != (lens.width, lens.height):
-        raise InputError(
-            f"{source.name}: expected photographs of {lens.width}x{lens.height}, as the run in {run.path} has, got "
-            f"{source.size[0]}x{source.size[1]}"
-        )
+    check_size(run, source, lens)
     map_view = MapView(lens, config.mapping.width_px, config.mapping.tau_uncertainty_px)
     final = _frames_of(run)
     chosen = view_positions(final, config)

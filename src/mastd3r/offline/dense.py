@@ -25,6 +25,7 @@ from ..mvs.mesh import meshed
 from ..mvs.views import StereoView
 from ..progress import Reporter
 from ..types import Source, Trajectory
+from .photographs import check_size
 from .renders import lens_of
 
 Array = NDArray[Any]
@@ -49,11 +50,7 @@ def stereo_views(run: Run, source: Source) -> list[StereoView]:
     What the mask says moves, and what the pinhole image has no data for, is not static.
     """
     lens = lens_of(run)
-    if source.size != (lens.width, lens.height):
-        raise InputError(
-            f"{source.name}: expected photographs of {lens.width}x{lens.height}, as the run in {run.path} has, got "
-            f"{source.size[0]}x{source.size[1]}"
-        )
+    check_size(run, source, lens)
     map_view = MapView(lens, WIDTH_PX, 1.0)
     chosen = with_frames_between(run.trajectory.tracked())
     place = {stamp(float(t)): pose for t, pose in zip(chosen.timestamps_s, chosen.world_from_cam, strict=True)}

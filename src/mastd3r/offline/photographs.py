@@ -39,16 +39,21 @@ class Photograph:
     file: Path | None  # where exactly these pixels are stored; None where reading changed them, and for a video
 
 
-def photographs(run: Run, trajectory: Trajectory, source: Source, lens: Camera | OpenCvLens) -> Iterator[Photograph]:
-    """The photographs of the poses in ``trajectory``, in order of time.
-
-    Raises InputError for a source whose images have another size than the lens, or that lacks some of them.
-    """
+def check_size(run: Run, source: Source, lens: Camera | OpenCvLens) -> None:
+    """Raise InputError for a source whose images are not of the size that the run's lens is for."""
     if source.size != (lens.width, lens.height):
         raise InputError(
             f"{source.name}: expected photographs of {lens.width}x{lens.height}, as the run in {run.path} has, got "
             f"{source.size[0]}x{source.size[1]}"
         )
+
+
+def photographs(run: Run, trajectory: Trajectory, source: Source, lens: Camera | OpenCvLens) -> Iterator[Photograph]:
+    """The photographs of the poses in ``trajectory``, in order of time.
+
+    Raises InputError for a source whose images have another size than the lens, or that lacks some of them.
+    """
+    check_size(run, source, lens)
     poses = {stamp(float(t)): p for t, p in zip(trajectory.timestamps_s, trajectory.world_from_cam, strict=True)}
     names = _Names(run, source)
     for frame in source.frames():
