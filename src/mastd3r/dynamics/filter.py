@@ -15,9 +15,10 @@ from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput, check_image, check_input
 from .depth import depth_log_ratio
 from .flow import HalfFlow
-from .fusion import accumulated, held, kept_share, resized, shown_mask, with_depth
+from .fusion import accumulated, alike, carried_along, kept_share, resized, shown_mask, with_depth
 from .motion import Information, texture_information
 from .motion_test import MotionTest, Past
+from .photometric import photo_variance
 from .refinement import EdgeRefinement, sigmoid
 
 Array = NDArray[Any]
@@ -72,7 +73,7 @@ class LogOddsFilter:
         arrival = self._arrive(gray, features)
         log_odds = arrival.carried
         if arrival.appearance is not None:
-            log_odds = log_odds + self.config.appearance.share * resized(arrival.appearance, log_odds)
+            log_odds = log_odds + self.config.appearance.share * resized(arrival.appearance, log_odds.shape)
         share = 1.0 if semantic is None else self.config.semantic.evidence_share
         return sigmoid(share * refinement.full(log_odds) + refinement.semantic_log_odds(semantic))
 
@@ -81,7 +82,7 @@ class LogOddsFilter:
         check_input(frame, self.refinement.width, self.refinement.height)
         arrival = self._arrive(frame.gray, frame.features)
         fresh, carried, evidence = self._evidence(frame, arrival)
-        log_odds = accumulated(*held(carried, fresh, arrival.appearance, self.config), self.config)
+        log_odds = accumulated(carried, fresh, alike(arrival.appearance, fresh.shape), self.config)
         if self.config.appearance.enabled and frame.features is not None:
             self.appearance.learn(frame.features, log_odds)
         mask = shown_mask(self.refinement, log_odds, frame, arrival.appearance, evidence)
@@ -136,7 +137,7 @@ class LogOddsFilter:
         """Last log-odds along the flow, forgetting; with texture, also faded where grey values belie the flow."""
         if self._log_odds is None or not self.config.temporal.enabled:
             return self._nothing
-        carried = self.config.temporal.memory * self._flow.pull(self._log_odds, to_last)
-        if texture is None:
-            return carried
-        return carried * kept_share(self.config, self._flow, small, self._past[-1].gray, to_last, texture)
+        kept = None
+        if texture is not None:
+            kept = kept_share(self.config, small, self._past[-1].gray, to_last, photo_variance(texture, self.config))
+        return carried_along(self._log_odds, to_last, kept, self.config.temporal.memory)

@@ -1,4 +1,4 @@
-"""Dense optical flow at half the working size, and its forward-backward check."""
+"""Dense optical flow at half the working size."""
 
 from __future__ import annotations
 
@@ -44,30 +44,6 @@ class HalfFlow:
         flow: Array = self._engines()[1].calc(a, b, None)
         return flow
 
-    def pull(self, value: Array, flow: Array, outside: float = 0.0) -> Array:
-        """``value`` of the flow's target image seen from its origin; ``outside`` where the flow leaves it."""
-        return cv2.remap(
-            value,
-            self.grid + flow,
-            None,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=outside,
-        )
-
     def warp(self, image: Array, target: Array) -> Array:
         """``image`` read at ``target`` (h, w, 2) pixels; the border is repeated."""
         return cv2.remap(image, target, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def round_trip_px(self, forward: Array, backward: Array) -> Array:
-        """(h, w) length of forward + backward; large where either leaves the image or is occluded."""
-        back = cv2.remap(
-            backward,
-            self.grid + forward,
-            None,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=(1e3, 1e3),
-        )
-        total = forward + back
-        return np.hypot(total[..., 0], total[..., 1])

@@ -5,29 +5,76 @@ from __future__ import annotations
 from typing import Any
 
 import cv2
+import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
-from .flow import HalfFlow
-from .motion import Information
-from .photometric import mismatch, photo_variance
+from .motion import _JIT
 from .refinement import EdgeRefinement
 
 Array = NDArray[Any]
+_F = np.float32
+OUTSIDE_GREY = -100.0  # of what lies outside of an image: like nothing in it
 HELD_LOG_ODDS = 2.0  # of what is carried and of the appearance, from which a thing that stops is held to be the same
 
 
-def kept_share(
-    config: DynamicsConfig, flow: HalfFlow, small: Array, other: Array, to_other: Array, texture: Information
-) -> Array:
-    """(h, w) 1 where grey values agree with the flow small -> other, fading to 0 where they belie it."""
-    pulled = flow.pull(other.astype(np.float32), to_other, -100.0)
-    found = mismatch(small.astype(np.float32), pulled, photo_variance(texture, config))
-    beyond = found - config.temporal.carry_mismatch
-    share: Array = np.exp(-0.5 * np.maximum(beyond, 0))
-    return share
+def kept_share(config: DynamicsConfig, small: Array, other: Array, to_other: Array, variance: Array) -> Array:
+    """(h, w) 1 where grey values agree with the flow small -> other, fading to 0 where they belie it.
+
+    ``variance`` (h, w) of grey values: ``photo_variance``.
+    """
+    share = np.empty(small.shape, np.float32)
+    _squared_difference(small, other, to_other, share)
+    share = cv2.blur(share, (3, 3))
+    share /= variance
+    np.maximum(share - np.float32(config.temporal.carry_mismatch), 0, out=share)
+    share *= np.float32(-0.5)
+    return np.exp(share, out=share)
+
+
+@nb.njit(**_JIT)
+def _squared_difference(small: Array, other: Array, flow: Array, out: Array) -> None:
+    """(small - other along the flow)²; outside of ``other`` it differs by far."""
+    h, w = out.shape
+    for j in range(h):
+        for i in range(w):
+            u, v = _F(i) + flow[j, i, 0], _F(j) + flow[j, i, 1]
+            there = _F(OUTSIDE_GREY)
+            if 0 <= u <= w - 1 and 0 <= v <= h - 1:
+                a, b = min(int(u), w - 2), min(int(v), h - 2)
+                p, q = u - _F(a), v - _F(b)
+                top = _F(other[b, a]) * (_F(1) - p) + _F(other[b, a + 1]) * p
+                low = _F(other[b + 1, a]) * (_F(1) - p) + _F(other[b + 1, a + 1]) * p
+                there = top * (_F(1) - q) + low * q
+            there -= _F(small[j, i])
+            out[j, i] = there * there
+
+
+def carried_along(log_odds: Array, flow: Array, kept: Array | None, memory: float) -> Array:
+    """(h, w) float32: log-odds of another frame, seen along the flow to it, forgetting; 0 where that leaves it.
+
+    ``kept`` (h, w): the share that survives, by ``kept_share``.
+    """
+    out = np.empty(log_odds.shape, np.float32)
+    _carried_along(log_odds, flow, _F(memory), out)
+    return out if kept is None else np.multiply(out, kept, out=out)
+
+
+@nb.njit(**_JIT)
+def _carried_along(log_odds: Array, flow: Array, memory: float, out: Array) -> None:
+    h, w = out.shape
+    for j in range(h):
+        for i in range(w):
+            u, v = _F(i) + flow[j, i, 0], _F(j) + flow[j, i, 1]
+            out[j, i] = 0
+            if 0 <= u <= w - 1 and 0 <= v <= h - 1:
+                a, b = min(int(u), w - 2), min(int(v), h - 2)
+                p, q = u - _F(a), v - _F(b)
+                top = log_odds[b, a] * (_F(1) - p) + log_odds[b, a + 1] * p
+                low = log_odds[b + 1, a] * (_F(1) - p) + log_odds[b + 1, a + 1] * p
+                out[j, i] = memory * (top * (_F(1) - q) + low * q)
 
 
 def with_depth(fresh: Array, depth: Array) -> Array:
@@ -36,24 +83,45 @@ def with_depth(fresh: Array, depth: Array) -> Array:
     return np.maximum(fresh, 0) + static_share * np.minimum(fresh, 0) + depth
 
 
-def held(carried: Array, fresh: Array, appearance: Array | None, config: DynamicsConfig) -> tuple[Array, Array]:
-    """(carried, fresh) where what was seen to move, and looks like what moves, is not refuted by standing still.
-
-    Log-odds at half size; ``appearance`` (h', w') is the classifier's. Both must hold: a parked car of the same
-    appearance was never seen to move, and is judged by its own evidence.
-    """
+def alike(appearance: Array | None, shape: tuple[int, ...]) -> Array | None:
+    """(h, w) float32 0..1: how much a pixel looks like what moves, of the classifier's log-odds (h', w')."""
     if appearance is None:
-        return carried, fresh
-    alike = np.clip(resized(appearance, carried) / HELD_LOG_ODDS - 0.5, 0, 1)
-    hold = np.clip(carried / HELD_LOG_ODDS, 0, 1) * alike
-    unforgotten = carried * (1 + hold * np.float32(1 / config.temporal.memory - 1))
-    return unforgotten, np.maximum(fresh, 0) + (1 - hold) * np.minimum(fresh, 0)
+        return None
+    return np.clip(resized(appearance, shape) * np.float32(1 / HELD_LOG_ODDS) - np.float32(0.5), 0, 1)
 
 
-def accumulated(carried: Array, fresh: Array, config: DynamicsConfig) -> Array:
-    """Log-odds carried over and log ratios of this frame added, clipped, float32."""
-    limit = config.max_log_odds
-    return np.clip(carried + config.evidence_gain * fresh, -limit, limit).astype(np.float32)
+def accumulated(carried: Array, fresh: Array, like: Array | None, config: DynamicsConfig) -> Array:
+    """Log-odds carried over and log ratios of this frame added, clipped, (h, w) float32 at half size.
+
+    What was seen to move, and looks like what moves (``like``, by ``alike``), is not refuted by standing still, and
+    not forgotten. Both must hold: a parked car of the same appearance was never seen to move, and is judged by its
+    own evidence.
+    """
+    out = np.empty(carried.shape, np.float32)
+    limits = _F(config.evidence_gain), _F(config.max_log_odds)
+    _accumulated(
+        carried, fresh, carried if like is None else like, _F(like is not None), _F(_forgotten(config)), *limits, out
+    )
+    return out
+
+
+def _forgotten(config: DynamicsConfig) -> float:
+    """What ``carried_along`` took, for what is held to be given back."""
+    return 1 / max(config.temporal.memory, 1e-3) - 1
+
+
+@nb.njit(**_JIT)
+def _accumulated(
+    carried: Array, fresh: Array, like: Array, holds: float, forgotten: float, gain: float, limit: float, out: Array
+) -> None:
+    one = _F(1)
+    for j in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            old, new = carried[j, i], fresh[j, i]
+            hold = holds * min(max(old * _F(1 / HELD_LOG_ODDS), _F(0)), one) * like[j, i]
+            old *= one + hold * forgotten
+            new = max(new, _F(0)) + (one - hold) * min(new, _F(0))
+            out[j, i] = min(max(old + gain * new, -limit), limit)
 
 
 def shown_mask(
@@ -68,6 +136,6 @@ def shown_mask(
     return DynamicMask(p, p > 0.5, terms)
 
 
-def resized(values: Array, like: Array) -> Array:
-    """``values`` at the size of ``like``."""
-    return cv2.resize(values, (like.shape[1], like.shape[0]), interpolation=cv2.INTER_LINEAR)
+def resized(values: Array, shape: tuple[int, ...]) -> Array:
+    """``values`` at another size (h, w)."""
+    return cv2.resize(values, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)

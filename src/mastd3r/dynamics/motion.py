@@ -1,4 +1,7 @@
-"""Flow against the flow of a rigid scene, normalised by what both may be wrong (III-A, our term b)."""
+"""Flow against the flow of a rigid scene, normalised by what both may be wrong (III-A, our term b).
+
+Maps of pixels are made in one pass each, in float32; ``tests/plain_motion.py`` holds the same in NumPy.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,9 @@ from .config import DynamicsConfig
 
 Array = NDArray[Any]
 _UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 squares
+_F = np.float32
+_FINITE = {"contract", "arcp", "nsz"}  # fast, but a number that is not finite stays one
+_JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FINITE}
 Information = tuple[Array, Array, Array]  # xx, xy, yy, each (h, w) px^-2
 
 
@@ -27,25 +33,44 @@ class RigidFlow:
     slope: Array  # (h, w, 2) float32 px per unit of inverse depth: the epipolar direction and its gain
     xy: Array  # (h, w, 2) float32 target on the past camera's unit plane
     inv_depth: Array  # (h, w) float32 seen from the past camera; <= 0 behind it
+    inside: Array  # (h, w) float32 1 where the target lies in the past image, before its camera; else 0
 
 
 def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Array) -> RigidFlow:
     """A static scene's flow current -> past. ``rays`` (3, h, w) float32 with z = 1, ``inv_depth`` (h, w) >= 0."""
-    m = past_from_cur.astype(np.float32)
-    x, y, z = (m[i, 0] * rays[0] + m[i, 1] * rays[1] + m[i, 2] + m[i, 3] * inv_depth for i in range(3))
-    scale = 1 / np.maximum(z, 1e-3)
-    x, y = x * scale, y * scale
-    dx, dy = (m[0, 3] - x * m[2, 3]) * scale, (m[1, 3] - y * m[2, 3]) * scale
-    u, v = x, y
-    if camera.distorted:
-        r2 = x * x + y * y
-        bend = 1 + r2 * (camera.k1 + r2 * (camera.k2 + camera.k3 * r2))
-        pull = 2 * (camera.k1 + r2 * (2 * camera.k2 + 3 * camera.k3 * r2)) * (x * dx + y * dy)
-        dx, dy = dx * bend + x * pull, dy * bend + y * pull
-        u, v = x * bend, y * bend
-    target = cv2.merge([u * camera.fx_px + camera.cx_px, v * camera.fy_px + camera.cy_px])
-    slope = cv2.merge([dx * camera.fx_px, dy * camera.fy_px])
-    return RigidFlow(target, slope, cv2.merge([x, y]), inv_depth * scale * np.where(z > 1e-3, 1.0, -1.0))
+    h, w = inv_depth.shape
+    target, slope, xy = (np.empty((h, w, 2), _F) for _ in range(3))
+    near, inside = np.empty((h, w), _F), np.empty((h, w), _F)
+    lens = np.array([camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.k1, camera.k2, camera.k3], _F)
+    _rigid(rays, past_from_cur.astype(_F), lens, inv_depth, target, slope, xy, near, inside)
+    return RigidFlow(target, slope, xy, near, inside)
+
+
+@nb.njit(**_JIT)
+def _rigid(
+    rays: Array, m: Array, lens: Array, inv: Array, target: Array, slope: Array, xy: Array, near: Array, inside: Array
+) -> None:
+    h, w = inv.shape
+    fx, fy, cx, cy, k1, k2, k3 = lens
+    one, least = _F(1), _F(1e-3)
+    right, low = _F(w - 1), _F(h - 1)
+    for j in range(h):
+        for i in range(w):
+            rx, ry, d = rays[0, j, i], rays[1, j, i], inv[j, i]
+            z = m[2, 0] * rx + m[2, 1] * ry + m[2, 2] + m[2, 3] * d
+            scale = one / max(z, least)
+            x = (m[0, 0] * rx + m[0, 1] * ry + m[0, 2] + m[0, 3] * d) * scale
+            y = (m[1, 0] * rx + m[1, 1] * ry + m[1, 2] + m[1, 3] * d) * scale
+            dx, dy = (m[0, 3] - x * m[2, 3]) * scale, (m[1, 3] - y * m[2, 3]) * scale
+            r2 = x * x + y * y
+            bend = one + r2 * (k1 + r2 * (k2 + k3 * r2))
+            pull = _F(2) * (k1 + r2 * (_F(2) * k2 + _F(3) * k3 * r2)) * (x * dx + y * dy)
+            u, v = x * bend * fx + cx, y * bend * fy + cy
+            target[j, i, 0], target[j, i, 1] = u, v
+            slope[j, i, 0], slope[j, i, 1] = (dx * bend + x * pull) * fx, (dy * bend + y * pull) * fy
+            xy[j, i, 0], xy[j, i, 1] = x, y
+            near[j, i] = d * scale if z > least else -d * scale
+            inside[j, i] = one if 0 < u < right and 0 < v < low and near[j, i] >= 0 else _F(0)
 
 
 def pose_jacobian(xy: Array, inv_depth: Array, focal_px: float) -> Array:
@@ -63,15 +88,35 @@ def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: fl
     ``jacobian`` (n, 2, 6), ``weight`` (n,), ``prior_sigma`` (6,): 1 sigma of how far a pose may be off.
     """
     twist = np.zeros(6)
-    rows, target = jacobian.reshape(-1, 6).astype(np.float64), residual.reshape(-1)
+    given = [np.ascontiguousarray(v, np.float64) for v in (jacobian, residual, weight)]
     scale, prior_info = 4 * noise_px, np.diag(1 / prior_sigma**2)
     for _ in range(6):
-        left = (target - rows @ twist).reshape(-1, 2)
-        w = weight / (1 + (left**2).sum(-1) / scale**2) / noise_px**2
-        weighted = rows * np.repeat(w, 2)[:, None]
-        twist = np.linalg.solve(rows.T @ weighted + prior_info, weighted.T @ target)
+        normal, right = _twist_system(*given, twist, noise_px, scale)
+        twist = np.linalg.solve(normal + prior_info, right)
         scale = max(0.6 * scale, 1.5 * noise_px)
     return twist
+
+
+@nb.njit(**_JIT)
+def _twist_system(
+    jacobian: Array, residual: Array, weight: Array, twist: Array, noise: float, scale: float
+) -> tuple[Array, Array]:
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    for n in range(len(residual)):
+        a, b = jacobian[n, 0], jacobian[n, 1]
+        rx, ry = residual[n, 0], residual[n, 1]
+        for k in range(6):
+            rx -= a[k] * twist[k]
+            ry -= b[k] * twist[k]
+        w = weight[n] / (1 + (rx * rx + ry * ry) / (scale * scale)) / (noise * noise)
+        for k in range(6):
+            right[k] += w * (a[k] * residual[n, 0] + b[k] * residual[n, 1])
+            for c in range(k + 1):
+                normal[k, c] += w * (a[k] * a[c] + b[k] * b[c])
+    for k in range(6):
+        for c in range(k):
+            normal[c, k] = normal[k, c]
+    return normal, right
 
 
 def texture_information(gray: Array, window_px: int, noise: float) -> Information:
@@ -80,37 +125,59 @@ def texture_information(gray: Array, window_px: int, noise: float) -> Informatio
     Its inverse is the covariance that the image itself allows a flow vector to have there.
     """
     smooth = cv2.GaussianBlur(gray, (0, 0), 0.8).astype(np.float32)
-    gx, gy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32
+    gx, gy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0, scale=1 / 32), cv2.Scharr(smooth, cv2.CV_32F, 0, 1, scale=1 / 32)
     size = (window_px, window_px)
     scale = window_px * window_px / (noise * noise)
-    xx, xy, yy = (cv2.blur(p, size) * scale for p in (gx * gx, gx * gy, gy * gy))
+    xx, xy, yy = (cv2.blur(cv2.multiply(*pair, scale=scale), size) for pair in ((gx, gx), (gx, gy), (gy, gy)))
     return xx, xy, yy
 
 
 def flow_covariance(information: Information, base_px: float, widest_px: float) -> Array:
     """(h, w, 3) xx, xy, yy of the flow's covariance: the inverse texture information, between base and widest."""
-    xx, xy, yy = information
-    floor = 1 / (widest_px * widest_px)
-    xx, yy = xx + floor, yy + floor
-    det = xx * yy - xy * xy
-    return cv2.merge([yy / det + base_px**2, -xy / det, xx / det + base_px**2])
+    out = np.empty((*information[0].shape, 3), _F)
+    _covariance(*information, _F(base_px * base_px), _F(1 / (widest_px * widest_px)), out)
+    return out
 
 
-def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
-    """Factor >= 1 by which ``cov`` (h, w, 3) is too small for the weighted majority of ``residual`` (h, w, 2).
+@nb.njit(**_JIT)
+def _covariance(xx: Array, xy: Array, yy: Array, base: float, floor: float, out: Array) -> None:
+    for j in range(xx.shape[0]):
+        for i in range(xx.shape[1]):
+            a, b, c = xx[j, i] + floor, xy[j, i], yy[j, i] + floor
+            share = _F(1) / (a * c - b * b)
+            out[j, i, 0], out[j, i, 1], out[j, i, 2] = c * share + base, -b * share, a * share + base
 
-    The median of the squared Mahalanobis length over that of two unit normals, 2 ln 2. Where pose or depths are worse
-    than they claim, most pixels show it, and the evidence of all must weaken.
+
+@nb.njit(**_JIT)
+def _bounded(value: Any) -> Any:
+    """Without what is not finite, and within what float32 squares."""
+    if math.isnan(value):
+        return _F(_UNKNOWN_PX)
+    return min(max(value, _F(-_UNKNOWN_PX)), _F(_UNKNOWN_PX))
+
+
+@nb.njit(**_JIT)
+def _widened(rx: Any, ry: Any, xx: Any, xy: Any, yy: Any, spread: Any) -> tuple[Any, Any]:
+    """p(r | cov + spread) / p(r | cov) of one pixel's residual, as (log of its exponential, its other factor).
+
+    1 where a number is not finite.
     """
-    rows = (slice(2, None, 4), slice(2, None, 4))
-    r, c, w = residual[rows].astype(float), cov[rows].astype(float), weight[rows]
-    known = (w > 0.5) & np.isfinite(r).all(-1) & np.isfinite(c).all(-1)
-    if known.sum() < 50:
-        return 1.0
-    r, c = np.clip(r[known], -_UNKNOWN_PX, _UNKNOWN_PX), c[known]
-    det = np.maximum(c[:, 0] * c[:, 2] - c[:, 1] ** 2, 1e-12)
-    length = (c[:, 2] * r[:, 0] ** 2 - 2 * c[:, 1] * r[:, 0] * r[:, 1] + c[:, 0] * r[:, 1] ** 2) / det
-    return max(1.0, float(np.median(length)) / (2 * np.log(2)))
+    if not math.isfinite(rx + ry + xx + xy + yy):
+        return _F(0), _F(1)
+    x, y = float(_bounded(rx)), float(_bounded(ry))
+    a, b, c = float(xx), float(xy), float(yy)  # along an epipolar line they are large, and det their small difference
+    det = max(a * c - b * b, 1e-12)
+    wide = max((a + spread) * (c + spread) - b * b, 1e-12)
+    cross = 2 * b * x * y
+    length = (c * x * x - cross + a * y * y) / det - ((c + spread) * x * x - cross + (a + spread) * y * y) / wide
+    return _F(min(max(0.5 * length, -80.0), 80.0)), _F(math.sqrt(det / wide))
+
+
+@nb.njit(**_JIT)
+def _odds(widened: Any, still_share: Any, outlier_share: Any) -> Any:
+    """p(r | moving) / p(r | static) of one pixel, where the widened normal is ``widened`` times the static one."""
+    one = _F(1)
+    return (still_share + (one - still_share) * widened) / ((one - outlier_share) + outlier_share * widened)
 
 
 def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Array:
@@ -120,40 +187,43 @@ def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Arr
     that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
     where a number is not finite.
     """
-    flat = residual.reshape(-1, 2), cov.reshape(-1, 3)
-    contiguous = (np.ascontiguousarray(v, np.float32) for v in flat)
-    ratio: Array = _log_ratio(*contiguous, config.motion.spread_px**2, config.still_share, config.outlier_share)
-    return ratio.reshape(residual.shape[:-1])
+    flat = (np.ascontiguousarray(v.reshape(-1, v.shape[-1]), _F) for v in (residual, cov))
+    shares = config.motion.spread_px**2, config.still_share, config.outlier_share
+    odds: Array = _all_odds(*flat, *map(_F, shares))
+    return np.log(odds).reshape(residual.shape[:-1])
 
 
-@nb.njit(cache=True, error_model="numpy", nogil=True)
-def _log_normal(rx: float, ry: float, xx: float, xy: float, yy: float) -> float:
-    det = max(xx * yy - xy * xy, 1e-12)
-    return -0.5 * ((yy * rx * rx - 2 * xy * rx * ry + xx * ry * ry) / det + math.log(det))
-
-
-@nb.njit(cache=True, error_model="numpy", nogil=True)
-def _log_ratio(residual: Array, cov: Array, spread: float, still_share: float, outlier_share: float) -> Array:
-    out = np.zeros(len(residual), np.float32)
+@nb.njit(**_JIT)
+def _all_odds(residual: Array, cov: Array, spread: float, still_share: float, outlier_share: float) -> Array:
+    out = np.ones(len(residual), np.float32)
     for n in range(len(residual)):
-        rx, ry = float(residual[n, 0]), float(residual[n, 1])
-        xx, xy, yy = float(cov[n, 0]), float(cov[n, 1]), float(cov[n, 2])  # squares of a lost pixel's leave float32
-        if not math.isfinite(rx + ry + xx + xy + yy):
-            continue
-        rx, ry = min(max(rx, -_UNKNOWN_PX), _UNKNOWN_PX), min(max(ry, -_UNKNOWN_PX), _UNKNOWN_PX)
-        still = _log_normal(rx, ry, xx, xy, yy)
-        wide = _log_normal(rx, ry, xx + spread, xy, yy + spread)
-        top = max(still, wide)
-        a, b = math.exp(still - top), math.exp(wide - top)
-        moving = still_share * a + (1 - still_share) * b
-        static = (1 - outlier_share) * a + outlier_share * b
-        out[n] = math.log(moving) - math.log(static)
+        log_part, factor = _widened(residual[n, 0], residual[n, 1], cov[n, 0], cov[n, 1], cov[n, 2], spread)
+        if not (log_part == 0 and factor == 1):
+            out[n] = _odds(factor * math.exp(log_part), still_share, outlier_share)
     return out
 
 
-def along_epipolar(cov: Array, slope: Array, inv_depth_sigma: Array) -> Array:
-    """``cov`` (h, w, 3) widened by the depth's 1 sigma along ``slope`` (h, w, 2): the part a depth may explain."""
-    reach = np.nan_to_num(slope * inv_depth_sigma[..., None], nan=_UNKNOWN_PX, posinf=_UNKNOWN_PX, neginf=-_UNKNOWN_PX)
-    reach = np.clip(reach, -_UNKNOWN_PX, _UNKNOWN_PX)
-    dx, dy = reach[..., 0], reach[..., 1]
-    return cv2.add(cov, cv2.merge([dx * dx, dx * dy, dy * dy]))
+def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
+    """Factor >= 1 by which ``cov`` (n, 3) is too small for the weighted majority of ``residual`` (n, 2).
+
+    The median of the squared Mahalanobis length over that of two unit normals, 2 ln 2. Where pose or depths are worse
+    than they claim, most pixels show it, and the evidence of all must weaken. ``weight`` (n,).
+    """
+    length = _lengths(np.ascontiguousarray(residual, float), np.ascontiguousarray(cov, float), weight)
+    if len(length) < 50:
+        return 1.0
+    return max(1.0, float(np.median(length)) / (2 * np.log(2)))
+
+
+@nb.njit(**_JIT)
+def _lengths(residual: Array, cov: Array, weight: Array) -> Array:
+    """Squared Mahalanobis lengths of what is weighted and finite."""
+    out, n = np.empty(len(residual)), 0
+    for k in range(len(residual)):
+        rx, ry, xx, xy, yy = residual[k, 0], residual[k, 1], cov[k, 0], cov[k, 1], cov[k, 2]
+        if weight[k] > 0.5 and math.isfinite(rx + ry + xx + xy + yy):
+            rx, ry = float(_bounded(_F(rx))), float(_bounded(_F(ry)))
+            det = max(xx * yy - xy * xy, 1e-12)
+            out[n] = (yy * rx * rx - 2 * xy * rx * ry + xx * ry * ry) / det
+            n += 1
+    return out[:n]

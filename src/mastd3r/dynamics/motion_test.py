@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -13,23 +13,33 @@ from numpy.typing import NDArray
 from ..camera.pinhole import Camera
 from ..concurrency import Worker
 from ..geometry.se3 import inverse
+from .comparison_kernels import (
+    add_grey_evidence,
+    flow_log_ratio,
+    grey_differences,
+    matched_share,
+    mean_ratio,
+    round_trip_confidence,
+    unexplained_every,
+)
 from .config import DynamicsConfig
 from .data import DynamicsInput
 from .flow import HalfFlow
 from .motion import (
     Information,
     RigidFlow,
-    along_epipolar,
     flow_covariance,
-    motion_log_ratio,
     noise_inflation,
     pose_jacobian,
     residual_twist,
     rigid_flow,
 )
-from .photometric import mismatch, photo_variance
+from .photometric import photo_variance
 
 Array = NDArray[Any]
+S = TypeVar("S")
+T = TypeVar("T")
+EVERY_PX = 4  # pixels that tell how wrong the majority is are so far apart
 
 
 @dataclass(frozen=True)
@@ -61,6 +71,16 @@ class Comparison:
     flow: Array  # (h, w, 2) float32, current -> past
 
 
+@dataclass(frozen=True)
+class Aligned:
+    """A frame and another one as a rigid scene would show it from the frame's pose."""
+
+    rigid: RigidFlow
+    stable: Array  # (h, w) uint8 the other image so drawn
+    left: Array  # (h, w, 2) float32 flow that is left, frame -> stable
+    flow: Array  # (h, w, 2) float32 frame -> other
+
+
 class MotionTest:
     """Holds the lens and the flow engine; knows nothing of earlier log-odds."""
 
@@ -79,67 +99,97 @@ class MotionTest:
         return Present(small, frame.world_from_cam, inv_depth, sigma, cov, photo_variance(texture, self.config))
 
     def compare(self, pairs: Sequence[tuple[Present, Array, Past]]) -> list[Comparison]:
-        """Log ratios of each (frame, its prior P(static) (h, w), other frame), in order, on two threads.
+        """Log ratios of each (frame, its prior P(static) (h, w), other frame), in order, on two threads."""
 
-        Every other one beside, always the same ones: what a flow engine finds may hang on what it was shown before.
-        """
-        beside = self._worker.submit(lambda: [self._one(*pair) for pair in pairs[1::2]])
-        found = [self._one(*pair) for pair in pairs[::2]]
+        def one(pair: tuple[Present, Array, Past]) -> Comparison:
+            frame, static, past = pair
+            aligned = self._aligned(frame, past)
+            back = self._flow.quick(aligned.stable, frame.gray)
+            inside = aligned.rigid.inside
+            confidence = round_trip_confidence(aligned.left, back, inside, self.config.motion.round_trip_px)
+            return Comparison(self._evidence(frame, static, past, aligned, confidence), aligned.flow)
+
+        return self._beside(one, pairs)
+
+    def aligned(self, pairs: Sequence[tuple[Present, Past, Present, Past]]) -> list[tuple[Aligned, Aligned]]:
+        """Each pair of frames, both ways: the one checks the other. What ``evidence`` is to be made of."""
+        ways = [way for a, a_past, b, b_past in pairs for way in ((a, b_past), (b, a_past))]
+        found = self._beside(lambda way: self._aligned(*way), ways)
+        return list(zip(found[::2], found[1::2], strict=True))
+
+    def evidence(self, views: Sequence[tuple[Present, Array, Past, Aligned, Aligned]]) -> list[Array]:
+        """(h, w) log ratios of each (frame, its prior P(static), other frame, the two aligned, and the way back)."""
+
+        def one(view: tuple[Present, Array, Past, Aligned, Aligned]) -> Array:
+            frame, static, past, there, back = view
+            sigma_px = self.config.motion.round_trip_px
+            confidence = round_trip_confidence(there.flow, back.flow, there.rigid.inside, sigma_px)
+            return self._evidence(frame, static, past, there, confidence)
+
+        return self._beside(one, views)
+
+    def _beside(self, make: Callable[[S], T], items: Sequence[S]) -> list[T]:
+        """``make`` of each, in order. Every other one beside, always the same ones: what a flow engine finds may hang
+        on what it was shown before."""
+        beside = self._worker.submit(lambda: [make(item) for item in items[1::2]])
+        found = [make(item) for item in items[::2]]
         for n, other in enumerate(beside.get()):
             found.insert(2 * n + 1, other)
         return found
 
-    def _one(self, frame: Present, static: Array, past: Past) -> Comparison:
+    def _aligned(self, frame: Present, past: Past) -> Aligned:
         """The past image is first drawn as a rigid scene would show it now; only what is left is flow."""
         assert self._camera is not None
-        c = self.config.motion
-        small = frame.gray
         past_from_cur = inverse(past.world_from_cam) @ frame.world_from_cam
         rigid = rigid_flow(self._camera, self._rays, past_from_cur, frame.inv_depth)
         stable = self._flow.warp(past.gray, rigid.target)
-        left = self._flow.between(small, stable)
-        inside = self._inside(rigid)
-        error = self._flow.round_trip_px(left, self._flow.quick(stable, small))
-        confidence = np.exp(-0.5 * (error / c.round_trip_px) ** 2) * inside
-        residual = left - self._pose_error(rigid, left, confidence * static)
-        wide = along_epipolar(frame.flow_cov, rigid.slope, frame.inv_depth_sigma)
-        if c.noise_inflation:
-            wide = wide * np.float32(max(1.0, noise_inflation(residual, wide, inside) / c.noise_tolerance))
+        left = self._flow.between(frame.gray, stable)
+        return Aligned(rigid, stable, left, rigid.target - self._flow.grid + left)
+
+    def _evidence(self, frame: Present, static: Array, past: Past, aligned: Aligned, confidence: Array) -> Array:
+        """(h, w) log ratio of two aligned frames."""
+        c, rigid, left = self.config.motion, aligned.rigid, aligned.left
+        twist = self._pose_error(rigid, left, confidence, static)
         covered = self._flow.warp(past.moving, rigid.target)
-        failed = 0.0
-        if c.doubts_unmatched:
-            scene = inside * static * (1 - covered)
-            failed = 1 - float((confidence * scene).sum()) / max(float(scene.sum()), 1.0)
-        ratio = motion_log_ratio(residual, wide, self._at_failure(failed)) * confidence
-        unmatched = (1 - confidence) * (1 - covered)
-        ratio += inside * self._grey_values(small, stable, left, inside, frame.photo_var, unmatched, failed)
-        return Comparison(ratio.astype(np.float32), rigid.target - self._flow.grid + left)
+        failed = 1 - matched_share(confidence, rigid.inside, static, covered) if c.doubts_unmatched else 0.0
+        geometry, sigma, cov = (left, rigid.xy, rigid.inv_depth, rigid.slope), frame.inv_depth_sigma, frame.flow_cov
+        inflation = 1.0
+        if c.noise_inflation:
+            residual, wide = unexplained_every(*geometry[:3], twist, rigid.slope, sigma, cov, EVERY_PX)
+            inside = rigid.inside[EVERY_PX // 2 :: EVERY_PX, EVERY_PX // 2 :: EVERY_PX].ravel()
+            inflation = max(1.0, noise_inflation(residual, wide, inside) / c.noise_tolerance)
+        shares = c.spread_px**2, self.config.still_share, self._wrong_share(failed)
+        gains = self.config.photometric.gain, self._unexplained_gain(failed)
+        ratio = flow_log_ratio(geometry, twist, (sigma, cov, inflation), shares)
+        grey = self._grey_values(frame.gray, aligned.stable, left, rigid.inside, frame.photo_var)
+        add_grey_evidence(ratio, (confidence, rigid.inside, covered), grey, gains)
+        return ratio
 
     def _grey_values(
-        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array, unmatched: Array, failed: float
-    ) -> Array:
-        """Static where the rigid warp fits better than the flow; moving where neither flow nor warp explains it.
+        self, small: Array, stable: Array, left: Array, inside: Array, noise: Array
+    ) -> tuple[Array, Array, Array]:
+        """Squared grey differences of 3x3 windows under the rigid warp and under the flow, and their variance.
 
-        What a moving thing covered in the past frame cannot match, and says nothing. Nor does it say more than
-        -log ``failed`` where that share of the static scene cannot be matched: as between views far apart.
+        What fits the rigid warp better than the flow is static; what neither explains moves. What a moving thing
+        covered in the past frame cannot match, and says nothing.
         """
-        cur, still = small.astype(np.float32), stable.astype(np.float32)
-        still *= float((cur * inside).mean()) / max(float((still * inside).mean()), 1e-3)
-        as_static = mismatch(cur, still, noise)
+        as_static, as_flow = np.empty(small.shape, np.float32), np.empty(small.shape, np.float32)
+        grey_differences(small, stable, mean_ratio(small, stable, inside), left, as_static, as_flow)
+        as_static, as_flow = cv2.blur(as_static, (3, 3)), cv2.blur(as_flow, (3, 3))
         if self.config.motion.noise_inflation:
-            typical = float(np.median(as_static[inside > 0])) if inside.any() else 1.0
-            noise = noise * max(1.0, typical / self.config.motion.noise_tolerance)
-            as_static = mismatch(cur, still, noise)
-        as_flow = mismatch(cur, self._flow.warp(still, self._flow.grid + left), noise)
-        unexplained = (1 - np.exp(-0.5 * np.maximum(as_static - 2, 0))) * unmatched
-        fits = np.clip(self.config.photometric.gain * (as_static - as_flow), -3, 0)
-        gain = min(self.config.photometric.unexplained_gain, -np.log(max(failed, 1e-6)))
-        return np.float32(gain) * unexplained + fits
+            seen = inside[::2, ::2] > 0
+            typical = float(np.median((as_static[::2, ::2] / noise[::2, ::2])[seen])) if seen.any() else 1.0
+            noise = noise * np.float32(max(1.0, typical / self.config.motion.noise_tolerance))
+        return as_static, as_flow, noise
 
-    def _at_failure(self, failed: float) -> DynamicsConfig:
+    def _unexplained_gain(self, failed: float) -> float:
+        """What grey values that nothing explains may say: at most -log of the share of the static scene that cannot
+        be matched, as between views far apart."""
+        return min(self.config.photometric.unexplained_gain, -float(np.log(max(failed, 1e-6))))
+
+    def _wrong_share(self, failed: float) -> float:
         """Where flow fails for a share of the static scene, more of what it does find is wrong as well."""
-        wrong = max(self.config.outlier_share, self.config.motion.wrong_where_failed * failed**2)
-        return replace(self.config, outlier_share=wrong)
+        return max(self.config.outlier_share, self.config.motion.wrong_where_failed * failed**2)
 
     def _background(self, frame: DynamicsInput) -> tuple[Array, Array]:
         """Half-size inverse depth and 1 sigma; unknown pixels get the median and a sigma as wide as the scene."""
@@ -157,13 +207,9 @@ class MotionTest:
             self._rays = np.moveaxis(small.rays(small.pixel_grid()), -1, 0).astype(np.float32)
             self._camera = small
 
-    def _inside(self, rigid: RigidFlow) -> Array:
-        x, y = rigid.target[..., 0], rigid.target[..., 1]
-        inside = (x > 0) & (y > 0) & (x < self.width - 1) & (y < self.height - 1) & (rigid.inv_depth >= 0)
-        return inside.astype(np.float32)
-
-    def _pose_error(self, rigid: RigidFlow, left: Array, weight: Array) -> Array:
-        """The part of the flow left over that a small error of the relative pose explains, (h, w, 2) float32."""
+    def _pose_error(self, rigid: RigidFlow, left: Array, confidence: Array, static: Array) -> Array:
+        """(6,) float32: the small error of the relative pose that explains most of the flow left over, in pixels of
+        this image a unit (times the focal length)."""
         assert self._camera is not None
         focal = self._camera.fx_px
         rows = (slice(3, None, 6), slice(3, None, 6))
@@ -171,13 +217,9 @@ class MotionTest:
         limit = np.deg2rad(self.config.motion.pose_sigma_deg)
         twist = residual_twist(
             pose_jacobian(rigid.xy[rows].reshape(-1, 2), rigid.inv_depth[rows].ravel(), focal),
-            left[rows].reshape(-1, 2).astype(float),
-            weight[rows].ravel().astype(float),
+            left[rows].reshape(-1, 2),
+            (confidence[rows] * static[rows]).ravel(),
             self.config.motion.flow_noise_px,
             np.array([limit / near] * 3 + [limit] * 3),
         )
-        x, y, near_by = rigid.xy[..., 0], rigid.xy[..., 1], rigid.inv_depth
-        v, w = (focal * twist[:3]).astype(np.float32), (focal * twist[3:]).astype(np.float32)
-        along_x = near_by * (v[0] - x * v[2]) - x * y * w[0] + (1 + x * x) * w[1] - y * w[2]
-        along_y = near_by * (v[1] - y * v[2]) - (1 + y * y) * w[0] + x * y * w[1] + x * w[2]
-        return cv2.merge([along_x.astype(np.float32), along_y.astype(np.float32)])
+        return (focal * twist).astype(np.float32)

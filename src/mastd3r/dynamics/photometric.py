@@ -1,10 +1,9 @@
-"""Grey values of two aligned images compared: which of two alignments explains a pixel (III-A, our term b)."""
+"""What grey values of two aligned images may differ by (III-A, our term b)."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
 from numpy.typing import NDArray
 
 from .config import DynamicsConfig
@@ -18,9 +17,3 @@ def photo_variance(information: tuple[Array, Array, Array], config: DynamicsConf
     per_px = config.motion.texture_noise**2 / 49
     gradient = (information[0] + information[2]) * per_px
     return c.noise**2 + c.shift_px**2 * gradient
-
-
-def mismatch(cur: Array, other: Array, variance: Array) -> Array:
-    """(h, w) mean squared grey difference of a 3x3 window over its variance: about 1 where the two agree."""
-    difference = cur - other
-    return cv2.blur(difference * difference, (3, 3)) / variance

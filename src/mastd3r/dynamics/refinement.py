@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .config import DynamicsConfig
 from .data import DynamicsInput, check_image
-from .regions import guided_coefficients, region_mean
+from .regions import Layer, guided_coefficients, region_mean
 
 Array = NDArray[Any]
 
@@ -51,13 +51,12 @@ class EdgeRefinement:
             return self.full(log_odds)
         c, semantic, limit = self.config.refinement, frame.semantic, self.config.max_log_odds
         guide = self.shrink(frame.gray).astype(np.float32)
-        layers = [guide, *_chroma(frame.color, (self.w, self.h), c.chroma_gain)]
+        edges: list[Layer] = [(guide, 1.0), *_chroma(frame.color, (self.w, self.h), c.chroma_gain)]
         if semantic is not None and self.config.semantic.enabled:
-            layers.append((c.semantic_contrast * self.shrink(semantic)).astype(np.float32))
-        edges = cv2.merge(layers) if len(layers) > 1 else guide
+            edges.append((self.shrink(semantic).astype(np.float32), c.semantic_contrast))
         weight = 0.05 + np.minimum(np.abs(log_odds), 3.0) / 3
         pooled = region_mean(edges, log_odds, weight, c.region_px, c.region_contrast)
-        a, b = guided_coefficients(guide, pooled, np.ones_like(pooled), c.edge_px, c.edge_contrast)
+        a, b = guided_coefficients(guide, pooled, c.edge_px, c.edge_contrast)
         full = self.full(a) * frame.gray + self.full(b)
         full = self._fine(full, frame, c.fine_contrast)
         if sharp is not None:
@@ -70,8 +69,8 @@ class EdgeRefinement:
         if frame.color is None:
             return full
         c, size = self.config.refinement, (self.width, self.height)
-        fine = cv2.merge([frame.gray.astype(np.float32), *_chroma(frame.color, size, c.chroma_gain)])
-        return region_mean(fine, full, np.ones_like(full), c.fine_px, contrast)
+        fine = [(frame.gray, 1.0), *_chroma(frame.color, size, c.chroma_gain)]
+        return region_mean(fine, full, None, c.fine_px, contrast)
 
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""
@@ -106,13 +105,13 @@ class EdgeRefinement:
         return cv2.resize(image, (self.width, self.height), interpolation=cv2.INTER_LINEAR)
 
 
-def _chroma(color: Array | None, size: tuple[int, int], gain: float) -> list[Array]:
-    """The two colour differences of CIE Lab, in grey levels' worth, each (h, w) float32; none without colour."""
+def _chroma(color: Array | None, size: tuple[int, int], gain: float) -> list[Layer]:
+    """The two colour differences of CIE Lab, (h, w) uint8, and what they count; none without colour."""
     if color is None:
         return []
     small = color if (color.shape[1], color.shape[0]) == size else cv2.resize(color, size, interpolation=cv2.INTER_AREA)
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-    return [gain * lab[..., n].astype(np.float32) for n in (1, 2)]
+    return [(cv2.extractChannel(lab, n), gain) for n in (1, 2)]
 
 
 def sigmoid(log_odds: Array) -> Array:

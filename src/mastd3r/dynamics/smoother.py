@@ -16,9 +16,10 @@ from .data import DynamicMask, DynamicsInput, check_input
 from .depth import depth_log_ratio
 from .depth_support import floating_log_ratio
 from .flow import HalfFlow
-from .fusion import accumulated, held, kept_share, shown_mask, with_depth
-from .motion import Information, texture_information
-from .motion_test import MotionTest, Past, Present
+from .fusion import accumulated, alike, carried_along, kept_share, shown_mask, with_depth
+from .motion import texture_information
+from .motion_test import Aligned, MotionTest, Past, Present
+from .photometric import photo_variance
 from .refinement import EdgeRefinement, sigmoid
 
 Array = NDArray[Any]
@@ -32,18 +33,30 @@ class _WindowFrame:
     input: DynamicsInput
     past: Past  # with the P(moving) that the frames before it give
     present: Present | None  # None without the motion term
-    texture: Information
+    variance: Array  # (h, w) of its grey values
     motion: Array  # (h, w) log ratios so far
     depth: Array | None  # (h, w) log ratio of its own depth
     appearance: Array | None  # (h', w') log-odds of the classifier
+    alike: Array | None  # (h, w) of them: how much each pixel looks like what moves
     floating: Array | None = None  # (h, w) log ratio of a depth that nothing holds
     flow: dict[int, Array] = field(default_factory=dict)  # -1: to the frame before, 1: to the frame after
     kept: dict[int, Array] = field(default_factory=dict)  # share of the log-odds that survives that way
 
+    _fresh: Array | None = None
+
     def fresh(self) -> Array:
         """Log ratios of this frame's own comparisons."""
-        fresh = self.motion if self.floating is None else with_depth(self.motion, self.floating)
-        return fresh if self.depth is None else with_depth(fresh, self.depth)
+        if self._fresh is None:
+            fresh = self.motion if self.floating is None else with_depth(self.motion, self.floating)
+            self._fresh = fresh if self.depth is None else with_depth(fresh, self.depth)
+        return self._fresh
+
+    def add_motion(self, log_ratio: Array) -> None:
+        """One more comparison."""
+        self.motion, self._fresh = self.motion + log_ratio, None
+
+
+_Pair = tuple[_WindowFrame, int, Aligned, Aligned]  # an earlier frame, frames from it to the newest; that to it, back
 
 
 class ForwardBackwardSmoother:
@@ -85,20 +98,36 @@ class ForwardBackwardSmoother:
         small, before = new.past.gray, list(self._window)
         wanted = self.config.temporal.smoother_gaps
         gaps = sorted({min(g, len(before)) for g in wanted} - {0})
+        found = self._aligned(new, [(before[-gap], gap) for gap in gaps])
+        carried = self._nothing
         if before:
-            new.flow[-1] = self._flow.quick(small, before[-1].past.gray)
+            nearest = next((there.flow for _, gap, there, _ in found if gap == 1), None)
+            new.flow[-1] = self._flow.quick(small, before[-1].past.gray) if nearest is None else nearest
             new.kept[-1] = self._kept(new, before[-1], new.flow[-1])
             carried = self._carried(self._causal, new, -1)
-            static = 1 - sigmoid(carried)
-            self._compare([(new, before[-gap], static, -gap) for gap in gaps])
-        else:
-            carried = self._nothing
+        static = 1 - sigmoid(carried)
+        views = [(new.present, static, other.past, there, back) for other, _, there, back in found if new.present]
+        for ratio in self._test.evidence(views):
+            new.add_motion(ratio)
         self._causal = self._added(carried, new)
         new.past = Past(small, frame.world_from_cam, self._moving(new, self._causal))
         self._window.append(new)
-        if self.config.temporal.backward:
-            earlier = [(before[-g], g) for g in gaps if g in wanted]
-            self._compare([(one, new, 1 - one.past.moving, gap) for one, gap in earlier])
+        if not self.config.temporal.backward:
+            return
+        found = [pair for pair in found if pair[1] in wanted]
+        views = [(o.present, 1 - o.past.moving, new.past, back, there) for o, _, there, back in found if o.present]
+        for (other, gap, _, back), ratio in zip(found, self._test.evidence(views), strict=True):
+            other.add_motion(ratio)
+            if gap == 1:
+                other.flow[1], other.kept[1] = back.flow, self._kept(other, new, back.flow)
+
+    def _aligned(self, new: _WindowFrame, others: list[tuple[_WindowFrame, int]]) -> list[_Pair]:
+        """The newest frame and each (other, frames between them), both ways, where both poses are known."""
+        if new.present is None or not new.input.pose_known:
+            return []
+        pairs = [(o, gap) for o, gap in others if o.present is not None and o.input.pose_known]
+        ways = self._test.aligned([(new.present, new.past, o.present, o.past) for o, _ in pairs if o.present])
+        return [(o, gap, *way) for (o, gap), way in zip(pairs, ways, strict=True)]
 
     def _described(self, frame: DynamicsInput) -> _WindowFrame:
         """A frame with every term that needs no other frame."""
@@ -113,19 +142,11 @@ class ForwardBackwardSmoother:
             appearance = self.appearance.log_odds(frame.features)
         present = self._test.present(frame, small, texture) if config.motion.enabled else None
         past = Past(small, frame.world_from_cam, self._nothing)
-        new = _WindowFrame(frame, past, present, texture, self._nothing, depth, appearance)
+        variance, looks = photo_variance(texture, config), alike(appearance, small.shape)
+        new = _WindowFrame(frame, past, present, variance, self._nothing, depth, appearance, looks)
         if config.support.enabled and frame.pose_known:
             new.floating = self.refinement.shrink(floating_log_ratio(frame, config))
         return new
-
-    def _compare(self, pairs: list[tuple[_WindowFrame, _WindowFrame, Array, int]]) -> None:
-        """The motion term of each (frame, other frame, P(static) of the frame, frames between them), of known poses."""
-        pairs = [p for p in pairs if p[0].input.pose_known and p[1].input.pose_known]
-        comparable = [(one.present, static, other.past) for one, other, static, _ in pairs if one.present is not None]
-        for (one, other, _, gap), found in zip(pairs, self._test.compare(comparable), strict=False):
-            one.motion = one.motion + found.log_ratio
-            if abs(gap) == 1:
-                one.flow[gap], one.kept[gap] = found.flow, self._kept(one, other, found.flow)
 
     def _oldest_mask(self) -> DynamicMask:
         """The mask of the oldest frame, against which all has been compared that will be; it leaves the window."""
@@ -159,13 +180,13 @@ class ForwardBackwardSmoother:
         """A neighbour's log-odds in ``to``, forgetting; the neighbour before (way -1) or after (1)."""
         if not self.config.temporal.enabled or way not in to.flow:
             return self._nothing
-        return self.config.temporal.memory * self._flow.pull(log_odds, to.flow[way]) * to.kept[way]
+        return carried_along(log_odds, to.flow[way], to.kept[way], self.config.temporal.memory)
 
     def _kept(self, one: _WindowFrame, other: _WindowFrame, flow: Array) -> Array:
-        return kept_share(self.config, self._flow, one.past.gray, other.past.gray, flow, one.texture)
+        return kept_share(self.config, one.past.gray, other.past.gray, flow, one.variance)
 
     def _added(self, carried: Array, frame: _WindowFrame) -> Array:
-        return accumulated(*held(carried, frame.fresh(), frame.appearance, self.config), self.config)
+        return accumulated(carried, frame.fresh(), frame.alike, self.config)
 
     def _moving(self, frame: _WindowFrame, log_odds: Array) -> Array:
         """P(moving) at half size, of the log-odds and the semantics, without refinement."""

@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 
 from ..types import FeatureMatches
 from .feature_matches import around, merged
-from .patches import align_patches, window
+from .patches import align_patches, wide, window
 
 Array = NDArray[Any]
 
 
 LEAST_ALIKE = 0.7  # correlation of two patches, below which they show different things
 SMOOTH_PX = 5.0  # blur of the dense flow before its slope is taken as the local warp
+SMOOTH_AT = 4  # which is done on a picture so many times smaller
+STEP_PX = 3.0  # of those differences
 MOST_BENT = 0.45  # largest entry of the local warp's difference from the identity; keeps it invertible
 ITERATIONS = 12
 
@@ -32,6 +34,29 @@ class FlowResult:
     dense: Array  # (h, w, 2) float32 ref -> new
 
 
+class _Field:
+    """Dense flow over images of one size."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.size = (width, height)
+        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+        self.grid = np.stack([x, y], -1)
+
+    def warp(self, new: Array, flow: Array) -> Array:
+        """``new`` (h, w) or (h, w, 2) seen through a flow ref -> new."""
+        return cv2.remap(new, self.grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+    def added(self, start: Array, rest: Array) -> Array:
+        """The flow that is found in two steps: ``rest`` is ref -> new as ``start`` warps it."""
+        return self.warp(start, rest) + rest
+
+    def resized(self, flow: Array) -> Array:
+        """A flow between images of another size, between images of this one."""
+        ratio = self.size[0] / flow.shape[1], self.size[1] / flow.shape[0]
+        way = cv2.INTER_AREA if ratio[0] < 1 else cv2.INTER_LINEAR
+        return cv2.resize(flow, self.size, interpolation=way) * np.array(ratio, np.float32)
+
+
 class FlowMatcher:
     """DIS flow from a predicted field, then patch alignment both ways at the chosen pixels."""
 
@@ -40,41 +65,43 @@ class FlowMatcher:
         self.tolerance_px = tolerance_px
         self.border_px = window_px // 2 + 1
         self._of_thread = local()
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        self._grid = np.stack([x, y], -1)
+        self._full, self._half = _Field(width, height), _Field((width + 1) // 2, (height + 1) // 2)
+        self._smooth = _Field(*(max(side // SMOOTH_AT, 4) for side in (width, height)))
         self._window = window(window_px, 0.27 * window_px)
 
     def _engine(self, name: str) -> Any:
-        """``whole``, ``rest`` or ``fast``; the calling thread's own: an engine has memory and serves one at a time."""
+        """``whole``, ``rest`` or ``near``; the calling thread's own: an engine has memory and serves one at a time."""
         if not hasattr(self._of_thread, "engines"):
             whole = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            rest, fast = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST) for _ in range(2))
-            rest.setFinestScale(1)  # half the time of medium
+            rest, near = (cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST) for _ in range(2))
+            for engine in (rest, near):
+                engine.setFinestScale(1)
             rest.setGradientDescentIterations(12)
             rest.setVariationalRefinementIterations(2)
-            self._of_thread.engines = {"whole": whole, "rest": rest, "fast": fast}
+            self._of_thread.engines = {"whole": whole, "rest": rest, "near": near}
         return self._of_thread.engines[name]
 
-    def dense(self, ref: Array, new: Array, start: Array | None = None, *, fast: bool = False) -> Array:
-        """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched."""
+    def dense(self, ref: Array, new: Array, start: Array | None = None, *, near: bool = False) -> Array:
+        """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched.
+
+        ``near``: that is a few pixels, and half the size will do.
+        """
         if start is None:
             flow: Array = self._engine("whole").calc(ref, new, None)
             return flow
-        warped = self.warp(new, start)
-        rest = self._engine("fast" if fast else "rest").calc(ref, warped, None)
-        moved = cv2.remap(start, self._grid + rest, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        return moved + rest
-
-    def warp(self, new: Array, flow: Array) -> Array:
-        """``new`` seen through a flow ref -> new, (h, w)."""
-        return cv2.remap(new, self._grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        field, engine = (self._half, "near") if near else (self._full, "rest")
+        if near:
+            ref, new = (cv2.resize(image, field.size, interpolation=cv2.INTER_AREA) for image in (ref, new))
+            start = field.resized(start)
+        flow = field.added(start, self._engine(engine).calc(ref, field.warp(new, start), None))
+        return self._full.resized(flow) if near else flow
 
     def match(self, ref: Array, new: Array, px: Array, start: Array | None = None, *, near: bool = False) -> FlowResult:
         """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward.
 
         ``near``: the start is within a few pixels already, so a quick dense search will do.
         """
-        flow = self.dense(ref, new, start, fast=near)
+        flow = self.dense(ref, new, start, near=near)
         target, weight = self.refine(ref, new, px, flow)
         return FlowResult(target, weight, flow)
 
@@ -86,8 +113,9 @@ class FlowMatcher:
 
     def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
         """Patches of ref at ``px`` found in new from a dense start, and back again: (p, 2) pixels, (p,) weight."""
-        smooth = cv2.GaussianBlur(flow, (0, 0), SMOOTH_PX)
-        return self._patches(ref, new, px, *_local(smooth, px))
+        smooth = cv2.GaussianBlur(self._smooth.resized(flow), (0, 0), SMOOTH_PX / SMOOTH_AT)
+        ratio = np.array([self.width, self.height]) / self._smooth.size
+        return self._patches(ref, new, px, *_local(smooth, px, ratio))
 
     def match_features(
         self, ref: Array, new: Array, px: Array, texture: Array, start: Array, features: FeatureMatches
@@ -106,7 +134,7 @@ class FlowMatcher:
 
     def _patches(self, ref: Array, new: Array, px: Array, start: Array, affine: Array) -> tuple[Array, Array]:
         """``refine`` from a start (p, 2) and a local warp (p, 2, 2) of each pixel."""
-        a, b = ref.astype(np.float32), new.astype(np.float32)
+        a, b = wide(ref), wide(new)
         target, alike = align_patches(a, b, px, start, affine, self._window, ITERATIONS)
         again = np.where(alike[:, None] > LEAST_ALIKE, target, -1.0)  # outside: not looked at
         back, alike_back = align_patches(b, a, again, px, np.linalg.inv(affine), self._window, ITERATIONS)
@@ -121,15 +149,20 @@ class FlowMatcher:
         return target, np.where(ok, np.exp(-((error / (0.5 * self.tolerance_px)) ** 2)), 0.0)
 
 
-def _local(flow: Array, px: Array) -> tuple[Array, Array]:
-    """Where ``px`` (p, 2) go, and the warp around them (p, 2, 2) d new / d ref, by differences over 3 px."""
-    at = px.astype(np.float32)[:, None]
+def _local(flow: Array, px: Array, ratio: Array) -> tuple[Array, Array]:
+    """Where ``px`` (p, 2) go, and the warp around them (p, 2, 2) d new / d ref, by differences over a step.
+
+    ``flow`` (h', w', 2) px of a picture that is smaller by ``ratio`` (2,).
+    """
+    at = ((px + 0.5) / ratio - 0.5).astype(np.float32)[:, None]
 
     def flow_at(dx: float, dy: float) -> Array:
         moved = at + np.array([dx, dy], np.float32)
-        return cv2.remap(flow, moved, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0].astype(float)
+        return cv2.remap(flow, moved, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0] * ratio
 
-    slope = np.stack([flow_at(3, 0) - flow_at(-3, 0), flow_at(0, 3) - flow_at(0, -3)], -1) / 6.0
+    step = STEP_PX / ratio
+    across, down = flow_at(step[0], 0) - flow_at(-step[0], 0), flow_at(0, step[1]) - flow_at(0, -step[1])
+    slope = np.stack([across, down], -1) / (2 * STEP_PX)
     return px + flow_at(0, 0), np.clip(slope, -MOST_BENT, MOST_BENT) + np.eye(2)
 
 

@@ -51,17 +51,25 @@ class TwoViewEstimator:
         """The frame against the keyframe that is followed, eq. (5)-(7), from where the last frame was."""
         if state.anchor is None or seen.blank:
             return AlignmentProblem.nothing(state.cam_from_anchor)
-        return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor)
+        return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor, near=True)
 
     def problem(
-        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, far: Far = None
+        self,
+        ref: Keyframe,
+        new: WorkFrame,
+        prior: Future[Array],
+        flow: Array | None,
+        guess: Array,
+        far: Far = None,
+        *,
+        near: bool = False,
     ) -> AlignmentProblem:
         """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
-        within the motion of one frame, or from the sparse features ``far``; ``guess`` (4, 4) new_from_ref."""
+        from the sparse features ``far`` or, ``near``, within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
         graph, started = self.graph, self._started(ref)
         variables = graph.variables[ref.id]
         inv_depth, info = (variables.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
-        known = Guess(graph.camera(), inv_depth, info, guess if started else None)
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow_is_near=near)
 
         def matched(start: Array | None, features: FeatureMatches | None = None) -> tuple[PairPrediction, Array]:
             how = replace(known, flow=start, features=features)
