@@ -6,11 +6,9 @@ import logging
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from importlib import metadata
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from .config import Config, MappingConfig, NetworksConfig
@@ -40,13 +38,6 @@ class Parts:
     semantics: SemanticPrior
     places: PlaceRecognition
     notes: list[str] = field(default_factory=list)
-
-    @cached_property
-    def grid_px(self) -> Array:
-        """(h, w, 2) float32 pixel centres of the working image."""
-        width, height = self.provider.size
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        return np.stack([x, y], -1)
 
 
 def parts_of(

@@ -120,7 +120,7 @@ class Guess:
     ref_inv_depth: Array | None = None  # (p,) at ref.px
     ref_depth_info: Array | None = None  # (p,) 1/variance of it, unit pixel noise
     new_from_ref: Array | None = None  # (4, 4)
-    flow: Array | None = None  # (h, w, 2) float32 ref -> new
+    flow: Array | None = None  # (h', w', 2) float32 ref -> new, in pixels of its own size
     flow_is_near: bool = False  # the flow comes from solved poses and depths: only the last pixels are searched
     features: FeatureMatches | None = None  # where ``flow`` comes from, if it comes from sparse features
 
@@ -132,7 +132,7 @@ class PairPrediction:
     matches: Matches
     ref: Pointmap  # in ref's camera, at matches.ref_px
     new_own: Pointmap | None  # new's points in NEW's camera, where the provider measures depth in a frame alone
-    flow: Array  # (h, w, 2) float32 ref -> new
+    flow: Array  # (h', w', 2) float32 ref -> new, in pixels of its own size
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,17 @@ class StaticMatches:
         """Matches that say something."""
         return int((self.weight > USABLE_WEIGHT).sum())
 
+    def thinned(self, most: int) -> StaticMatches:
+        """At most so many of the matches that say something, evenly from all over ref."""
+        used = np.flatnonzero(self.weight > USABLE_WEIGHT)
+        if len(used) <= most:
+            return self
+        some = used[np.linspace(0, len(used) - 1, most).astype(int)]
+        px, inv_depth, info, target, weight = (
+            values[some] for values in (self.px, self.inv_depth, self.depth_info, self.target, self.weight)
+        )
+        return StaticMatches(px, inv_depth, info, target, weight, self.intrinsics)
+
     def residual_px(self, new_from_ref: Array) -> Array:
         """(p,) norm of the re-mapping residual; 1e3 behind the camera."""
         r, z = edge_residuals(self.px, self.inv_depth, self.target, new_from_ref, self.intrinsics)

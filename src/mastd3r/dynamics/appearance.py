@@ -23,6 +23,7 @@ SAMPLES = 400  # pixels that one frame teaches
 SURE_LOG_ODDS = 3.0  # evidence from which a pixel teaches with full weight
 STANDING_SHARE = 0.25  # how often a thing that can move is seen to stand: one such sample says only so much
 PRIOR_INFO = 4.0  # of every weight, in pixels' worth
+FINE_CELLS = 96  # a row: twice as many as what is asked needs
 FRAME_SHARE = 0.2  # pixels of a frame repeat one another: each counts for so much
 
 
@@ -81,10 +82,12 @@ class AppearanceClassifier:
         """(h', w') float32 log-odds of moving by appearance alone; None before anything was seen to move.
 
         Beyond the base rate. Shrunk where the weights are unsure (MacKay's approximation), bounded by
-        ``appearance.max_log_odds``.
+        ``appearance.max_log_odds``. Of fine ``features`` every four cells are answered together.
         """
         if self._moving_samples < SAMPLES / 4 or len(self._centre) != features.shape[2]:
             return None
+        if features.shape[1] >= FINE_CELLS:
+            features = _every_four(features)
         z = self._lifted(features.reshape(-1, features.shape[2]).astype(np.float32))
         spread = np.linalg.cholesky(np.linalg.inv(self._info)).astype(np.float32)
         variance = ((z @ spread) ** 2).sum(1)
@@ -114,6 +117,13 @@ class AppearanceClassifier:
         return np.concatenate([np.ones((len(x), 1), np.float32), linear, waves], 1)
 
 
+def _every_four(features: Array) -> Array:
+    """(h' // 2, w' // 2, c) means of two by two cells."""
+    h, w = features.shape[0] // 2 * 2, features.shape[1] // 2 * 2
+    f = features[:h, :w]
+    return np.asarray((f[::2, ::2] + f[1::2, ::2] + f[::2, 1::2] + f[1::2, 1::2]) * np.float32(0.25))
+
+
 def plain_descriptors(image: Array, width: int, height: int) -> Array:
     """(height, width, 11) float32 of a photograph (h, w, 3) uint8: colour at three scales, strength of its edges.
 
@@ -123,5 +133,5 @@ def plain_descriptors(image: Array, width: int, height: int) -> Array:
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB) / np.array([50, 25, 25], np.float32)
     step_x, step_y = (cv2.Sobel(lab[..., 0], cv2.CV_32F, *axis) for axis in ((1, 0), (0, 1)))
     edges = [np.hypot(step_x, step_y), np.abs(step_x) - np.abs(step_y)]
-    return np.dstack([lab, *(cv2.GaussianBlur(lab, (0, 0), s) for s in (1.5, 4.0)),
+    return cv2.merge([lab, *(cv2.GaussianBlur(lab, (0, 0), s) for s in (1.5, 4.0)),
                       *(cv2.GaussianBlur(e, (0, 0), 2.0) for e in edges)])  # fmt: skip

@@ -7,13 +7,14 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..camera.pinhole import Camera
 from ..geometry.inpainting import inpainted_grid
+from ..geometry.nearest_kernels import three_nearest
 from ..geometry.se3 import transform
 
 Array = NDArray[Any]
+BUCKET_PX = 12.0  # about the distance of neighbouring points
 LEAST_CONFIDENCE = 0.05  # a depth that is known less well is not carried on
 
 
@@ -52,8 +53,7 @@ def carried(
     if ok.sum() < 8:
         return np.full(len(at_px), float(np.median(inv_depth))), np.zeros(len(at_px))
     landed, new_inv = camera.project(points[ok]), 1 / points[ok][:, 2]
-    found = cKDTree(landed).query(at_px, k=3)
-    distance, nearest = np.asarray(found[0]), np.asarray(found[1])
+    distance, nearest = three_nearest(landed, at_px, BUCKET_PX)
     weight = confidence[ok][nearest] / (distance + 1.0)
     value = (new_inv[nearest] * weight).sum(1) / weight.sum(1)
     near = np.exp(-((distance[:, 0] / 24.0) ** 2))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..types import FeatureMatches
 from .feature_matches import around, merged
+from .flow_maps import pulled, resized_flow
 from .patches import align_patches, wide, window
 
 Array = NDArray[Any]
@@ -31,30 +32,7 @@ class FlowResult:
 
     target: Array  # (p, 2) float64 pixels in the new image
     weight: Array  # (p,) float64 in 0..1 from the forward-backward error; 0 = no match
-    dense: Array  # (h, w, 2) float32 ref -> new
-
-
-class _Field:
-    """Dense flow over images of one size."""
-
-    def __init__(self, width: int, height: int) -> None:
-        self.size = (width, height)
-        x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-        self.grid = np.stack([x, y], -1)
-
-    def warp(self, new: Array, flow: Array) -> Array:
-        """``new`` (h, w) or (h, w, 2) seen through a flow ref -> new."""
-        return cv2.remap(new, self.grid + flow, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-    def added(self, start: Array, rest: Array) -> Array:
-        """The flow that is found in two steps: ``rest`` is ref -> new as ``start`` warps it."""
-        return self.warp(start, rest) + rest
-
-    def resized(self, flow: Array) -> Array:
-        """A flow between images of another size, between images of this one."""
-        ratio = self.size[0] / flow.shape[1], self.size[1] / flow.shape[0]
-        way = cv2.INTER_AREA if ratio[0] < 1 else cv2.INTER_LINEAR
-        return cv2.resize(flow, self.size, interpolation=way) * np.array(ratio, np.float32)
+    dense: Array  # (h', w', 2) float32 ref -> new, at half the size where a start was near
 
 
 class FlowMatcher:
@@ -65,8 +43,8 @@ class FlowMatcher:
         self.tolerance_px = tolerance_px
         self.border_px = window_px // 2 + 1
         self._of_thread = local()
-        self._full, self._half = _Field(width, height), _Field((width + 1) // 2, (height + 1) // 2)
-        self._smooth = _Field(*(max(side // SMOOTH_AT, 4) for side in (width, height)))
+        self._half_size = (width + 1) // 2, (height + 1) // 2
+        self._smooth_size = max(width // SMOOTH_AT, 4), max(height // SMOOTH_AT, 4)
         self._window = window(window_px, 0.27 * window_px)
 
     def _engine(self, name: str) -> Any:
@@ -84,17 +62,16 @@ class FlowMatcher:
     def dense(self, ref: Array, new: Array, start: Array | None = None, *, near: bool = False) -> Array:
         """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched.
 
-        ``near``: that is a few pixels, and half the size will do.
+        ``near``: that is a few pixels, and half the size will do; that of the flow is half then, too.
         """
         if start is None:
             flow: Array = self._engine("whole").calc(ref, new, None)
             return flow
-        field, engine = (self._half, "near") if near else (self._full, "rest")
         if near:
-            ref, new = (cv2.resize(image, field.size, interpolation=cv2.INTER_AREA) for image in (ref, new))
-            start = field.resized(start)
-        flow = field.added(start, self._engine(engine).calc(ref, field.warp(new, start), None))
-        return self._full.resized(flow) if near else flow
+            ref, new = (cv2.resize(image, self._half_size, interpolation=cv2.INTER_AREA) for image in (ref, new))
+        start = resized_flow(start, ref.shape[1], ref.shape[0])
+        rest: Array = self._engine("near" if near else "rest").calc(ref, pulled(new, start), None)
+        return pulled(start, rest) + rest
 
     def match(self, ref: Array, new: Array, px: Array, start: Array | None = None, *, near: bool = False) -> FlowResult:
         """Flow at pixels ``px`` (p, 2) of ref, refined to sub-pixel, checked forward and backward.
@@ -113,8 +90,8 @@ class FlowMatcher:
 
     def refine(self, ref: Array, new: Array, px: Array, flow: Array) -> tuple[Array, Array]:
         """Patches of ref at ``px`` found in new from a dense start, and back again: (p, 2) pixels, (p,) weight."""
-        smooth = cv2.GaussianBlur(self._smooth.resized(flow), (0, 0), SMOOTH_PX / SMOOTH_AT)
-        ratio = np.array([self.width, self.height]) / self._smooth.size
+        smooth = cv2.GaussianBlur(resized_flow(flow, *self._smooth_size), (0, 0), SMOOTH_PX / SMOOTH_AT)
+        ratio = np.array([self.width, self.height]) / self._smooth_size
         return self._patches(ref, new, px, *_local(smooth, px, ratio))
 
     def match_features(

@@ -82,12 +82,11 @@ class CovisibilityEdges:
 
     def _found(self, graph: KeyframeGraph, i: int, j: int) -> list[ReprojectionFactor]:
         """Edges both ways, not yet added; the way back is searched where there is one there."""
-        grid_px = self.parts.grid_px
         if graph.initialised:
             start, back = rigid_flow(graph, i, j), rigid_flow(graph, j, i)
         elif (i, j - 1) in self.flows and (j - 1, j) in self.flows:
-            start = chained_flow(self.flows[i, j - 1], self.flows[j - 1, j], grid_px)
-            back = invert_flow(start, grid_px)
+            start = chained_flow(self.flows[i, j - 1], self.flows[j - 1, j])
+            back = invert_flow(start)
         else:
             return []
         there = self._edge(graph, i, j, start)

@@ -148,7 +148,7 @@ class Keyframes:
         graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
         if not graph.initialised:
             self.edges.flows[before.id, kf.id] = view.pair.flow
-        self.edges.add_one_way(graph, kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
+        self.edges.add_one_way(graph, kf.id, before.id, invert_flow(view.pair.flow))
         if graph.initialised:
             self._connect(kf, before.id)
         else:
