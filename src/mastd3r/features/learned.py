@@ -16,9 +16,15 @@ from ..types import FeatureMatches, WorkFrame
 from .verification import is_static, of_one_geometry
 
 Array = NDArray[Any]
+Rows = tuple[Array, Array, Array]  # (m,) rows of two images' features that belong together, and how surely
 MOST_FEATURES = 1024  # of an image; those found best
 MIN_MATCHES = 25  # that agree on one geometry
 FEATURES_OF_A_PLACE, SAME_FEATURE = 200, 0.85  # that are compared, and the cosine above which two are the same
+NEAR_COSINE = 0.82  # of descriptors that may show the same
+ENOUGH_NEAREST, ENOUGH_SHARE = (
+    120,
+    0.5,
+)  # nearest descriptors of one geometry: so many, and such a share, need no network
 KEPT_IMAGES, KEPT_PAIRS = 256, 256  # that are remembered: a pair is asked both ways, and again as keyframes
 
 
@@ -55,7 +61,10 @@ class LearnedFeatures:
         self._load = load
         self._networks: tuple[FeatureNetwork, MatchNetwork] | None = None
         self._seen: OrderedDict[int, tuple[Array, Array, Array]] = OrderedDict()  # id of an image: it, its features
-        self._pairs: OrderedDict[tuple[int, int], tuple[Any, tuple[Array, Array, Array]]] = OrderedDict()
+        self._pairs: OrderedDict[tuple[int, int], tuple[Any, Rows]] = (
+            OrderedDict()
+        )  # of two images: what the network says
+        self._neighbours: OrderedDict[tuple[int, int], tuple[Any, Rows]] = OrderedDict()  # the same by descriptors
         self._one_at_a_time = threading.Lock()  # edges are made beside tracking
 
     def matches(
@@ -63,12 +72,10 @@ class LearnedFeatures:
     ) -> FeatureMatches | None:
         """See ``protocols.FeatureMatcher``."""
         with self._one_at_a_time, one_torch_thread():
-            px_ref, px_new = self._described(ref)[0], self._described(new)[0]
-            rows_ref, rows_new, score = self._matched(ref, new)
-        a, b = px_ref[rows_ref].astype(float), px_new[rows_new].astype(float)
-        static = is_static(a, ref_moving) & is_static(b, new_moving)
-        agree = np.flatnonzero(static)[of_one_geometry(a[static], b[static])]
-        return FeatureMatches(a[agree], b[agree], score[agree]) if len(agree) >= MIN_MATCHES else None
+            found, share = self._agreeing(ref, new, ref_moving, new_moving, self._nearest(ref, new))
+            if len(found.ref_px) < ENOUGH_NEAREST or share < ENOUGH_SHARE:
+                found, _ = self._agreeing(ref, new, ref_moving, new_moving, self._matched(ref, new))
+        return found if len(found.ref_px) >= MIN_MATCHES else None
 
     def alike(self, image: Array, others: Sequence[Array]) -> Array:
         """(n,) share of the best features of an image that each of the others has too; NaN where nobody asked before.
@@ -96,6 +103,27 @@ class LearnedFeatures:
         for a, b, found in memory.pairs:
             self._pairs[id(a.gray), id(b.gray)] = ((a.gray, b.gray), found)
 
+    def _agreeing(
+        self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None, rows: Rows
+    ) -> tuple[FeatureMatches, float]:
+        """The matches of static places that agree on one geometry, and their share."""
+        rows_ref, rows_new, score = rows
+        a, b = (self._described(i)[0][r].astype(float) for i, r in ((ref, rows_ref), (new, rows_new)))
+        static = is_static(a, ref_moving) & is_static(b, new_moving)
+        agree = np.flatnonzero(static)[of_one_geometry(a[static], b[static])]
+        return FeatureMatches(a[agree], b[agree], score[agree]), len(agree) / max(int(static.sum()), 1)
+
+    def _nearest(self, ref: Array, new: Array) -> Rows:
+        """Rows of both whose descriptors are one another's nearest, and their cosine: a fraction of a network's work."""
+        key = (id(ref), id(new))
+        if key not in self._neighbours:
+            there, cosine = _mutual(self._described(ref)[1], self._described(new)[1], NEAR_COSINE)
+            at = np.flatnonzero(there >= 0)
+            self._neighbours[key] = ((ref, new), (at, there[at], cosine[at].astype(float)))
+            if len(self._neighbours) > KEPT_PAIRS:
+                self._neighbours.popitem(last=False)
+        return self._neighbours[key][1]
+
     def _networks_loaded(self) -> tuple[FeatureNetwork, MatchNetwork]:
         if self._networks is None:
             self._networks = self._load()
@@ -111,7 +139,7 @@ class LearnedFeatures:
         self._seen.move_to_end(key)
         return self._seen[key][1:]
 
-    def _matched(self, ref: Array, new: Array) -> tuple[Array, Array, Array]:
+    def _matched(self, ref: Array, new: Array) -> Rows:
         """Rows of both that belong together, and their probability; a pair seen from the other side is the same."""
         here, back = (id(ref), id(new)), (id(new), id(ref))
         if back in self._pairs and here not in self._pairs:
@@ -130,7 +158,14 @@ def _common(a: Array, b: Array) -> float:
     """Share of descriptors that are one another's nearest, and near."""
     if min(len(a), len(b)) == 0:
         return 0.0
+    return float((_mutual(a, b, SAME_FEATURE)[0] >= 0).mean())
+
+
+def _mutual(a: Array, b: Array, least: float) -> tuple[Array, Array]:
+    """(n,) row of ``b`` that is nearest to each of ``a`` and the other way round, else -1; (n,) cosine of the nearest."""
+    if min(len(a), len(b)) == 0:
+        return np.full(len(a), -1), np.zeros(len(a), np.float32)
     cosine = a @ b.T
     there, back = cosine.argmax(1), cosine.argmax(0)
-    mutual = (back[there] == np.arange(len(a))) & (cosine[np.arange(len(a)), there] > SAME_FEATURE)
-    return float(mutual.mean())
+    best = cosine[np.arange(len(a)), there]
+    return np.where((back[there] == np.arange(len(a))) & (best > least), there, -1), best

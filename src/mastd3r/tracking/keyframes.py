@@ -101,7 +101,8 @@ class Keyframes:
         if near is None:
             return None
         kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.variables[near].cam_from_world)
-        view = self.two_view.estimate(kf, last.work, last.moving, rigid_flow_to(graph, near, cam_from_world), guess)
+        flow = rigid_flow_to(graph, near, cam_from_world)
+        view = self.two_view.estimate(kf, last.work, last.moving, flow, guess, near=True)
         nearby = view.motion_ratio <= t.keyframe_motion_ratio
         if not self.two_view.accepted(view) or not nearby or matched_share(kf, view.weight) < KNOWN_PLACE_MATCHED:
             return None
@@ -131,7 +132,8 @@ class Keyframes:
         """The last frame that was tracked becomes a keyframe, which is followed from here on."""
         anchor, last = state.anchor, state.last
         assert anchor is not None and last is not None
-        view = self.two_view.estimate(anchor, last.work, last.moving, state.flow, state.cam_from_anchor)
+        guess = state.cam_from_anchor
+        view = self.two_view.estimate(anchor, last.work, last.moving, state.flow, guess, near=True)
         return self._add(state, view)
 
     def _add(self, state: TrackingState, view: TwoView) -> TrackingState:
@@ -203,7 +205,8 @@ class Keyframes:
         if last is not None:
             last.moving.get()
         if last is not None and state.flow is not None and state.anchor is not None:
-            view = self.two_view.estimate(state.anchor, last.work, last.moving, state.flow, state.cam_from_anchor)
+            guess = state.cam_from_anchor
+            view = self.two_view.estimate(state.anchor, last.work, last.moving, state.flow, guess, near=True)
             t = self.config.tracking
             enough = LAST_MOTION * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
             if self.two_view.accepted(view) and view.motion_ratio > enough:

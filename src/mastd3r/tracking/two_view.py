@@ -97,10 +97,18 @@ class TwoViewEstimator:
         return TwoView(ref, problem.pair, problem.weight, alignment, *motion)
 
     def estimate(
-        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], flow: Array | None, guess: Array, far: Far = None
+        self,
+        ref: Keyframe,
+        new: WorkFrame,
+        prior: Future[Array],
+        flow: Array | None,
+        guess: Array,
+        far: Far = None,
+        *,
+        near: bool = False,
     ) -> TwoView:
         """``problem``, and its coarse, scale and fine stage in order."""
-        problem = self.problem(ref, new, prior, flow, guess, far)
+        problem = self.problem(ref, new, prior, flow, guess, far, near=near)
         view = self.view(ref, problem, align(self.parts.aligner, problem))
         assert view is not None
         return view
