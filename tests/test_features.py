@@ -234,6 +234,33 @@ def test_a_pair_is_matched_once_and_both_ways_alike() -> None:
     assert half is not None and network.matched == 1 and (half.ref_px[:, 0] > WIDTH // 2 - 1).all()
 
 
+class Telling(Counting):
+    """The same with descriptors of which each is like one of any other image; ``shared`` of them."""
+
+    def __init__(self, shared: int) -> None:
+        super().__init__()
+        self.shared = shared
+
+    def describe(self, image: Array, most: int) -> tuple[Array, Array]:
+        px, _ = super().describe(image, most)
+        code = np.random.default_rng(0).normal(size=(len(px), 64)).astype(np.float32)
+        own = np.random.default_rng(int(image[0, 0]) + 1).normal(size=code.shape).astype(np.float32)
+        code[self.shared :] = own[self.shared :]
+        return px, np.asarray(code / np.linalg.norm(code, axis=1, keepdims=True), np.float32)
+
+
+@pytest.mark.parametrize(("shared", "asked"), [(154, 0), (110, 1), (0, 1)])
+def test_the_matching_network_is_asked_where_nearest_descriptors_are_too_few(shared: int, asked: int) -> None:
+    network = Telling(shared)
+    some = LearnedFeatures(lambda: (network, network))
+    a, b = np.zeros((HEIGHT, WIDTH), np.uint8), np.full((HEIGHT, WIDTH), 3, np.uint8)
+    for _ in range(2):
+        found = some.matches(a, b, None, None)
+        assert found is not None and network.matched == asked
+        if not asked:  # each is beside itself; the network of this test puts it beside its neighbour
+            assert len(found.ref_px) >= 120 and (found.new_px - found.ref_px == 3).all()
+
+
 @needs_wheel
 def test_a_place_is_told_from_others_by_what_it_shares() -> None:
     features = learned()

@@ -114,7 +114,7 @@ class LearnedFeatures:
         return FeatureMatches(a[agree], b[agree], score[agree]), len(agree) / max(int(static.sum()), 1)
 
     def _nearest(self, ref: Array, new: Array) -> Rows:
-        """Rows of both whose descriptors are one another's nearest, and their cosine: a fraction of a network's work."""
+        """Rows of both whose descriptors are one another's nearest, and their cosine: little work."""
         key = (id(ref), id(new))
         if key not in self._neighbours:
             there, cosine = _mutual(self._described(ref)[1], self._described(new)[1], NEAR_COSINE)
@@ -162,7 +162,7 @@ def _common(a: Array, b: Array) -> float:
 
 
 def _mutual(a: Array, b: Array, least: float) -> tuple[Array, Array]:
-    """(n,) row of ``b`` that is nearest to each of ``a`` and the other way round, else -1; (n,) cosine of the nearest."""
+    """(n,) row of ``b`` nearest to each of ``a``, where that is mutual, else -1; (n,) cosine of the nearest."""
     if min(len(a), len(b)) == 0:
         return np.full(len(a), -1), np.zeros(len(a), np.float32)
     cosine = a @ b.T
