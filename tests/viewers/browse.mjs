@@ -2,11 +2,11 @@
 //
 //   node browse.mjs NODE_MODULES CHROMIUM
 //
-// A job a line on standard input: {url, width, height, lit, clicks, canvas, out, evaluate}; an answer a line on standard
+// A job a line on standard input: {url, width, height, lit, clicks, evaluate, canvas, out}; an answer a line on standard
 // output.
 // lit: wait until so much of the largest canvas is not black. clicks: labels of what is pressed then, in order.
-// canvas, out: files for what the largest canvas, and the page (whole: all of it), then show.
-// evaluate: what is asked of the page then. The answer: {said: what the console complained of, foreign: addresses other
+// evaluate: what is asked of the page then. canvas, out: files for what the largest canvas, and the page (whole: all of
+// it), show at last. The answer: {said: what the console complained of, foreign: addresses other
 // than the page's own, lit_at_ms: when the canvas was lit, value}, or {error}.
 import { mkdtempSync, rmSync, writeFileSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -73,12 +73,12 @@ async function browse(context, job) {
       lit_at_ms = Date.now();
     }
     for (const label of job.clicks ?? []) await tab.getByText(label, { exact: true }).first().click();
+    const value = job.evaluate ? await tab.evaluate(job.evaluate) : null;
     if (job.canvas) writeFileSync(job.canvas, await atRest(tab, () => tab.evaluate(`(${canvasData})()`)));
     if (job.out) {
       const options = { fullPage: Boolean(job.whole), timeout: 120_000 };
       writeFileSync(job.out, await atRest(tab, async () => (await tab.screenshot(options)).toString("base64")));
     }
-    const value = job.evaluate ? await tab.evaluate(job.evaluate) : null;
     return { said, foreign, lit_at_ms, value };
   } catch (error) {
     return { error: `${error.message}\n${said.join("\n")}` };

@@ -29,7 +29,7 @@ class Panel:
             self.jump = gui.add_button("Jump to this camera", disabled=True)
             self.follow = gui.add_checkbox("Follow", False, hint="the view goes along with the frame")
             self._image = gui.add_image(NO_IMAGE, visible=False)
-            self.masked = gui.add_checkbox("Show what moves", True, visible=False)
+            self.masked = gui.add_checkbox("What moves", True, visible=False)
             self._about_image = gui.add_markdown("")
         self._layers = gui.add_folder("Layers")
         with self._layers:

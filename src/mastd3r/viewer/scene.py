@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
+from ..export.mesh_files import linear
 from ..export.pictures import fitted, mask_overlay
 from ..mapping.gaussian_arrays import GaussianArrays
 from ..types import State
@@ -34,7 +35,7 @@ LABELS: dict[Layer, str] = {
     "path": "Camera path",
 }
 FRAMES_A_NODE = 64  # a frame that is added sends again the lines of at most so many
-FRUSTUM_RATIO, LINE_PX = 0.06, 2.0  # frusta in typical depths
+FRUSTUM_RATIO, LINE_PX = 0.03, 1.5  # frusta in typical depths
 NEAR_RATIO, FAR_RATIO = 1e-3, 1e4  # clipping planes in typical depths
 IMAGE_WIDTH_PX = 640
 WORLD_FROM_GLB = (0.0, 1.0, 0.0, 0.0)  # quaternion wxyz: glTF is right, up, back, a half turn about x
@@ -254,7 +255,8 @@ class Scene:
 
     def _lines(self, name: str, points: Array, colours: Array, width_px: float) -> None:
         if len(points):
-            self._server.scene.add_line_segments(name, points, colours, thickness=width_px, thickness_units="screen")
+            light = np.rint(255 * linear(colours / 255)).astype(np.uint8)  # viser takes colours of lines for light
+            self._server.scene.add_line_segments(name, points, light, thickness=width_px, thickness_units="screen")
         else:
             self._server.scene.remove_by_name(name)
 
