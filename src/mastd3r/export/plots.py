@@ -51,7 +51,7 @@ def top_view(
 
     half = np.array([(width - left - right) / 2, (height - top - bottom) / 2]) / scale
     out = _grid((middle - half, middle + half), place, (left, width - right, top, height - bottom))
-    out.append(_label(width / 2, height - 6, f"from above, {unit}", "middle"))
+    out.append(_label(width / 2, height - 6 if width == WIDTH else 12, f"from above, {unit}", "middle"))
     if true_flat is not None:
         out += _lines(place(true_flat), np.isfinite(true_flat).all(1), "truth")
     xy = place(flat)

@@ -137,11 +137,13 @@ def _videos(data: ReportData) -> str:
 
 def _files(files: Sequence[RunFile]) -> str:
     """Links to all that lies beside the page."""
-    rows = [
-        f'<tr><td><a href="{quote(f.name)}{"" if f.count is None else "/"}">{escape(f.name)}</a></td>'
-        f'<td class="words">{escape(f.words)}</td><td class="value text">{size_shown(f)}</td></tr>'
-        for f in files
-    ]
+    rows = []
+    for f in files:
+        address, known = quote(f.name) + ("" if f.count is None else "/"), "known" if f.words else ""
+        link = f'<a class="{known}" href="{address}">{escape(f.name)}</a>'
+        rows.append(
+            f'<tr><td>{link}</td><td class="words">{escape(f.words)}</td><td class="value">{size_shown(f)}</td></tr>'
+        )
     text = "Links lead to what lies beside this page in its run folder."
     return _section("Files", text, f"<table>{''.join(rows)}</table>") if rows else ""
 
