@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+import webbrowser
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -253,6 +254,17 @@ def test_without_the_extra_the_report_opens(
     assert "pip install 'mastd3r-slam[view]'" in capsys.readouterr().out
     monkeypatch.setattr(command, "_browse", lambda address: False)
     assert main(["view", str(run), "--report"]) == 0 and "no browser found" in capsys.readouterr().out
+
+
+def test_a_browser_for_terminals_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webbrowser, "get", lambda: webbrowser.GenericBrowser("lynx"))
+    assert not command._browse("http://127.0.0.1:1")
+
+    def none() -> None:
+        raise webbrowser.Error("could not locate runnable browser")
+
+    monkeypatch.setattr(webbrowser, "get", none)
+    assert not command._browse("http://127.0.0.1:1")
 
 
 @needs_viser

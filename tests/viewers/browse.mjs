@@ -69,7 +69,7 @@ async function browse(context, job) {
     await tab.goto(job.url);
     let lit_at_ms = null;
     if (job.lit) {
-      await tab.waitForFunction(`(${litShare})() >= ${job.lit}`, null, { timeout: 60_000, polling: 50 });
+      await tab.waitForFunction(`(${litShare})() >= ${job.lit}`, null, { timeout: 60_000, polling: 200 });
       lit_at_ms = Date.now();
     }
     for (const label of job.clicks ?? []) await tab.getByText(label, { exact: true }).first().click();

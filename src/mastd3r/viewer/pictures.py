@@ -14,7 +14,6 @@ from ..config import SourceConfig, config_from_dict
 from ..errors import ConfigError, InputError, SlamError
 from ..export.read_run import Run
 from ..export.run_folder import stamp
-from ..sources import open_source
 
 Array = NDArray[Any]
 ImageAt = Callable[[float], Array | None]  # (h, w, 3) uint8 RGB of a time, None where there is none
@@ -61,6 +60,8 @@ class Pictures:
         return Picture(image, mask, "; ".join([*missing, what]))
 
     def _open(self) -> None:
+        from ..sources import open_source  # half a second to load, and the first view does not wait for it
+
         try:
             path = Path(str((self._run.record.get("source") or {}).get("path") or ""))
             if not path.name or not path.exists():
