@@ -91,7 +91,7 @@ def compared(run: Run, photograph: Array, shot: Array) -> tuple[float, float]:
     wanted = cv2.remap(photograph, at, None, cv2.INTER_CUBIC).clip(0, 1)
     inside = ((at >= EDGE_PX) & (at <= np.array([lens.width, lens.height]) - 1 - EDGE_PX)).all(-1)
     inside[:EDGE_PX] = inside[-EDGE_PX:] = inside[:, :EDGE_PX] = inside[:, -EDGE_PX:] = False
-    theirs, own = psnr(wanted[inside], shot[inside]), psnr(wanted[inside], ours[inside])
+    theirs, own = psnr(wanted, shot, inside), psnr(wanted, ours, inside)
     assert theirs is not None and own is not None
     return theirs, own
 

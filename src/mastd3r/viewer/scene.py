@@ -71,6 +71,7 @@ class Scene:
         self.panel.follow.on_update(lambda _: self._followed())
         self.panel.masked.on_update(lambda _: self._show_image())
         self.panel.point_size.on_update(lambda _: self._size_points())
+        server.on_client_connect(lambda _: self._on_select(self._selected) if self._selected >= 0 else None)
 
     # frames
 
@@ -114,7 +115,10 @@ class Scene:
                 self.select(min(max(kept, 0), len(self._path) - 1))
 
     def on_select(self, told: Callable[[int], None]) -> None:
-        """``told`` gets the index of the frame under the slider whenever it changes; it may call ``set_image``."""
+        """``told`` gets the index of the frame under the slider whenever it changes, and when a browser comes.
+
+        It may call ``set_image``.
+        """
         self._on_select = told
 
     def select(self, index: int) -> None:

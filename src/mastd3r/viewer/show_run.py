@@ -85,10 +85,10 @@ def show_run(path: Path | str, host: str = LOOPBACK, port: int | None = None, fi
         alone = content.splat is None and content.dense is None and content.mesh is None
         scene.set_cloud("sparse", points, colours, sparse_spacing, visible=alone)
     scene.say(*notices)
-    scene.on_select(_Shower(scene, Pictures(content.run), [t for t, _, _ in content.frames]))
     if content.frames:
         times_s, poses, states = zip(*content.frames, strict=True)
         scene.add_frames(times_s, poses, states)
+    scene.on_select(_Shower(scene, Pictures(content.run), [t for t, _, _ in content.frames]))
     return Viewer(scene, address(server), notices)
 
 
