@@ -46,7 +46,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
         "export",
         "networks",
     ),
-    ("parts", "experiments"),
+    ("parts", "experiments", "viewer"),
     ("tracking",),
     ("offline",),
     ("slam",),
@@ -75,6 +75,7 @@ HEAVY = {  # package: who may import it
     "av": {"sources", "export"},  # reads videos, writes them
     "numba": {"geometry", "dynamics", "mapping", "pointmap", "mvs"},
     "rich": {"cli"},
+    "viser": {"viewer"},  # the optional browser viewer
 }
 # recordings are CUDA's; config: mapping.device; gsplat's backend
 NAMES_A_DEVICE = {"mapping.rasterise", "mapping.rasterise_gsplat", "networks.record", "config"}

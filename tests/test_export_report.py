@@ -110,8 +110,10 @@ def test_the_page_of_a_run(run_path: Path) -> None:
     page = write_report(run_path, data).read_text()
     tags = parsed(page)
     text = " ".join(tags.text)
-    assert len(tags.targets) == 15
-    assert all(target.startswith("data:image/jpeg;base64,") for target in tags.targets)
+    pictures = [target for target in tags.targets if target.startswith("data:image/jpeg;base64,")]
+    assert len(pictures) == 15
+    written = {p.name for p in run_path.iterdir() if not p.name.startswith(".")} - {"report.html", "alpha", "depth"}
+    assert {target.rstrip("/") for target in tags.targets} - set(pictures) == written  # alpha, depth: empty
     assert not re.search(r"https?://|<script|@import|url\(", page)
     for words in (
         "stopped with Ctrl-C & all",
@@ -125,6 +127,19 @@ def test_the_page_of_a_run(run_path: Path) -> None:
     assert "mastd3r run 'it'\"'\"'s <me>.mp4'" in text
     order = [page.index(h) for h in ("Photograph, splat", "What moves", "<h2>Trajectory", "<h2>Figures", "<h2>Time")]
     assert order == sorted(order)
+
+
+def test_videos_play_first_and_every_file_is_linked(run_path: Path) -> None:
+    for name in ("flight.mp4", "masks.mp4", "my <mesh> #2.glb", "gaussians.ply.part"):
+        (run_path / name).write_bytes(bytes(3 * 2**19))
+    page = report_html(gather_report_data(read_run(run_path), frames(), {0.0: 20.0}))
+    videos = re.findall(r'<video src="([^"]+)"([^>]*)>', page)
+    assert [name for name, _ in videos] == ["flight.mp4", "masks.mp4"]
+    assert all("controls muted playsinline" in how and 'poster="data:image/jpeg' in how for _, how in videos)
+    assert page.index("<video") < page.index("Photograph, splat")
+    assert "my%20%3Cmesh%3E%20%232.glb" in parsed(page).targets
+    assert "my &lt;mesh&gt; #2.glb" in page and "1.5 MiB" in page and "60 files" in page
+    assert "gaussians.ply.part" not in page and ".reserve" not in page
 
 
 def test_the_same_run_gives_the_same_page(run_path: Path) -> None:

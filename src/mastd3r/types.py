@@ -54,6 +54,7 @@ class Source(Protocol):
     It may have ``focal_hint_px``, the focal length at full width where something speaks of it (EXIF), else None, and
     ``focal_source``, in words what does. The lens starts there, and is still found from the frames.
     It may have ``files``, the image file (Path) of every frame by the frame's index; a video has none.
+    It may have ``image_at``, which gives the photograph of a time (h, w, 3) without reading those before it.
     """
 
     name: str

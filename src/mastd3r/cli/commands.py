@@ -162,20 +162,6 @@ def export(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def view(args: argparse.Namespace, console: Console) -> int:
-    """``mastd3r view``."""
-    import webbrowser
-
-    from ..pipeline import load
-
-    report = load(args.run).path / "report.html"
-    if not report.is_file():
-        raise ConfigError(f"{report}: expected the report of a complete run, got none")
-    Console().print(f"opening {report}", soft_wrap=True, markup=False)
-    webbrowser.open(report.resolve().as_uri())
-    return 0
-
-
 def doctor(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r doctor``."""
     from ..export.machine import machine_info

@@ -10,6 +10,7 @@ EXIT_FAULT, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 KEPT = "what was computed so far is in the run folder"
 KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
 KEPT_BY["export"] = "nothing half-written stays"
+KEPT_BY["view"] = "the run is as it was"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

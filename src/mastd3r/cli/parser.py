@@ -14,6 +14,7 @@ from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
 from .download import download_parser
+from .view import view_parser
 from .weights import weights_parser
 
 INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
@@ -53,9 +54,7 @@ def parser() -> argparse.ArgumentParser:
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     _export_parser(known.add_parser("export", help="write a run for other tools"))
-    view = known.add_parser("view", help="open a run's report in the browser")
-    view.add_argument("run", type=Path, help="run folder")
-    view.set_defaults(act=commands.view)
+    view_parser(known.add_parser("view", help="show a run in the browser"))
     bench_parser(known.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(known.add_parser("weights", help="list, download and check the weights of the networks"))
     download_parser(known.add_parser("download", help="list and bring the public datasets"))

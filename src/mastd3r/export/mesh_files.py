@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import InputError
 from .files import write_bytes
+from .point_cloud import read_ply, vertex_colors, vertices_of
 
 Array = NDArray[Any]
 VERTEX = np.dtype([(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
 FACE = np.dtype([("count", "u1"), ("vertices", "<i4", 3)])
+FACE_LISTS = tuple(("list", count, index) for count in ("uchar", "uint8") for index in ("int", "int32"))
 GLTF_FROM_WORLD = np.array([1.0, -1.0, -1.0])  # glTF: +y up, the camera looks along -z; a half turn about x
 FLOAT, USHORT, UINT = 5126, 5123, 5125  # glTF's component types
 ARRAY_BUFFER, INDEX_BUFFER = 34962, 34963
@@ -46,6 +49,48 @@ def ply_bytes(vertices_world: Array, faces: Array, colors: Array) -> bytes:
         "end_header",
     ]
     return ("\n".join(head) + "\n").encode() + rows.tobytes() + triangles.tobytes()
+
+
+def is_glb(path: Path) -> bool:
+    """Whether a file is a binary glTF, by its first bytes. Raises InputError for one that is cut or cannot be read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+        size = path.stat().st_size
+    except OSError as e:
+        raise InputError(f"{path}: expected a readable cloud or mesh, got {e.strerror or e}") from e
+    if head[:4] != b"glTF":
+        return False
+    if len(head) < 12 or struct.unpack("<I", head[8:])[0] != size:
+        raise InputError(f"{path}: expected a whole .glb file, got one whose length is not what its head says")
+    return True
+
+
+def has_faces(path: Path) -> bool:
+    """Whether a PLY is a mesh. Raises InputError."""
+    return any(element.name == "face" for element in read_ply(path)[0])
+
+
+def read_mesh(path: Path) -> tuple[Array, Array, Array]:
+    """Vertices (n, 3) float32, triangles (m, 3) int32, colours (n, 3) uint8 of a little-endian PLY of triangles.
+
+    White where it has no colours. Raises InputError.
+    """
+    elements, body = read_ply(path)
+    if [e.name for e in elements] != ["vertex", "face"]:
+        raise InputError(f"{path}: expected vertices and faces, got {', '.join(e.name for e in elements)}")
+    rows = vertices_of(path, elements[0], body)
+    listed = elements[1].properties
+    if not set("xyz") <= set(rows.dtype.names or ()) or len(listed) != 1 or listed[0][:3] not in FACE_LISTS:
+        raise InputError(f"{path}: expected x, y, z and faces as lists of int, got {listed}")
+    rest = body[rows.nbytes :]
+    if len(rest) != elements[1].count * FACE.itemsize:
+        raise InputError(f"{path}: expected {elements[1].count} triangles, got {len(rest)} bytes of faces")
+    faces = np.frombuffer(rest, FACE)
+    triangles = faces["vertices"]
+    if (faces["count"] != 3).any() or (len(faces) and not 0 <= triangles.min() <= triangles.max() < len(rows)):
+        raise InputError(f"{path}: expected triangles of its {len(rows)} vertices, got other faces")
+    return np.stack([rows[name] for name in "xyz"], -1).astype(np.float32), triangles, vertex_colors(rows)
 
 
 def glb_bytes(vertices_world: Array, faces: Array, colors: Array) -> bytes:

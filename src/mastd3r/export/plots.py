@@ -12,13 +12,22 @@ from numpy.typing import NDArray
 from ..types import Trajectory
 
 Array = NDArray[Any]
-WIDTH = 1080
+WIDTH = 1080  # of a plot beside which a page has room
+NARROW = 340  # for a phone: the same letters, fewer ticks
 STATE_NAMES = {"started": "tracked", "tracked": "tracked", "interpolated": "interpolated", "lost": "lost"}
 MAX_POINTS = 1500  # of one line; more than the plot has pixels
+LEAST_POINTS = NARROW / WIDTH  # of those, for a line that spans little of the plot
 
 
-def top_view(trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None) -> str:
-    """The path seen from above, equal axes, the longest extent lying across.
+def top_view(
+    trajectory: Trajectory,
+    positions: Array,
+    truth: Array | None,
+    unit: str,
+    error: Array | None,
+    width: int = WIDTH,
+) -> str:
+    """The path seen from above, equal axes, the longest extent lying across; ``width`` WIDTH or NARROW.
 
     ``positions`` (n, 3) in ``unit``; ``truth`` (n, 3) likewise, NaN where there is none. ``error`` (n,)
     colours the path where given, otherwise its states do. Directions of view and keyframes are marked.
@@ -32,17 +41,17 @@ def top_view(trajectory: Trajectory, positions: Array, truth: Array | None, unit
     span = span if span > 1e-9 else 1.0  # a camera that never moves: a dot in the middle
     pad = 0.06 * span
     left, right, top, bottom = 56, 24, 20, 44
-    scale = min((WIDTH - left - right) / (high[0] - low[0] + 2 * pad), 460 / (high[1] - low[1] + 2 * pad))
+    scale = min((width - left - right) / (high[0] - low[0] + 2 * pad), 460 / (high[1] - low[1] + 2 * pad))
     height = max(220.0, (high[1] - low[1] + 2 * pad) * scale + top + bottom)
     middle = (low + high) / 2
-    centre = np.array([left + (WIDTH - left - right) / 2, top + (height - top - bottom) / 2])
+    centre = np.array([left + (width - left - right) / 2, top + (height - top - bottom) / 2])
 
     def place(points: Array) -> Array:
         return np.asarray((points - middle) * scale * np.array([1.0, -1.0]) + centre)
 
-    half = np.array([(WIDTH - left - right) / 2, (height - top - bottom) / 2]) / scale
-    out = _grid((middle - half, middle + half), place, (left, WIDTH - right, top, height - bottom))
-    out.append(_label(WIDTH / 2, height - 6, f"from above, {unit}", "middle"))
+    half = np.array([(width - left - right) / 2, (height - top - bottom) / 2]) / scale
+    out = _grid((middle - half, middle + half), place, (left, width - right, top, height - bottom))
+    out.append(_label(width / 2, height - 6 if width == WIDTH else 12, f"from above, {unit}", "middle"))
     if true_flat is not None:
         out += _lines(place(true_flat), np.isfinite(true_flat).all(1), "truth")
     xy = place(flat)
@@ -51,11 +60,18 @@ def top_view(trajectory: Trajectory, positions: Array, truth: Array | None, unit
     out += [_dot(p, "keyframe", 3) for p in xy[trajectory.is_keyframe]]
     out += [_dot(xy[0], "start", 6), _label(xy[0][0] - 9, xy[0][1] + 4, "start", "end", "name")]
     if error is not None and np.isfinite(error).any():
-        out += _colour_bar(float(np.nanmax(error)), unit, WIDTH - right - 180, height - 18)
-    return _svg(height, out, "trajectory from above")
+        out += _colour_bar(float(np.nanmax(error)), unit, width - right - 180, height - 18)
+    return _svg(width, height, out, "trajectory from above")
 
 
-def over_time(trajectory: Trajectory, positions: Array, truth: Array | None, unit: str, error: Array | None) -> str:
+def over_time(
+    trajectory: Trajectory,
+    positions: Array,
+    truth: Array | None,
+    unit: str,
+    error: Array | None,
+    width: int = WIDTH,
+) -> str:
     """Right, down and forward of the first camera over time, and the error below where truth gives one."""
     times = trajectory.timestamps_s - trajectory.timestamps_s[0]
     names = [("right", 0), ("down", 1), ("forward", 2)]
@@ -64,7 +80,7 @@ def over_time(trajectory: Trajectory, positions: Array, truth: Array | None, uni
     height = rows * (row_height + gap) + 44
     duration = max(float(times[-1]), 1e-9)
     out: list[str] = []
-    x = left + times / duration * (WIDTH - left - right)
+    x = left + times / duration * (width - left - right)
     for row in range(rows):
         top = 26 + row * (row_height + gap)
         is_error = row == len(names)
@@ -82,7 +98,7 @@ def over_time(trajectory: Trajectory, positions: Array, truth: Array | None, uni
 
         for tick in ticks(low, high, 4):
             y = float(level(np.array(tick)))
-            out.append(f'<line class="grid" x1="{left}" x2="{WIDTH - right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+            out.append(f'<line class="grid" x1="{left}" x2="{width - right}" y1="{y:.1f}" y2="{y:.1f}"/>')
             out.append(_label(left - 8, y + 4, number(tick, high - low), "end"))
         title = "error" if is_error else names[row][0]
         if true is not None:
@@ -95,27 +111,32 @@ def over_time(trajectory: Trajectory, positions: Array, truth: Array | None, uni
             out += [_dot(p, "keyframe", 2.2) for p in xy[trajectory.is_keyframe]]
         out.append(_label(left, top - 8, f"{title}, {unit}", "start", "name"))
     foot = height - 26
-    for tick in ticks(0, duration, 10):
-        out.append(_label(left + tick / duration * (WIDTH - left - right), foot, number(tick, duration), "middle"))
-    out.append(_label(WIDTH / 2, height - 6, "seconds from the first frame", "middle"))
-    return _svg(height, out, "position over time")
+    for tick in ticks(0, duration, 10 if width == WIDTH else 4):
+        out.append(_label(left + tick / duration * (width - left - right), foot, number(tick, duration), "middle"))
+    out.append(_label(width / 2, height - 6, "seconds from the first frame", "middle"))
+    return _svg(width, height, out, "position over time")
 
 
-def timing_bars(timings_s: dict[str, float]) -> str:
-    """One bar a stage, with its seconds and its share."""
+def timing_bars(timings_s: dict[str, float], width: int = WIDTH) -> str:
+    """One bar a stage, with its seconds and its share; where there is little room, its name stands above."""
     total = sum(timings_s.values())
     if total <= 0:
         return ""
-    left, bar, step = 190, WIDTH - 190 - 130, 30
+    above = width < WIDTH
+    left, step = (0, 46) if above else (190, 30)
+    bar = width - left - 130
     longest = max(timings_s.values())
     out: list[str] = []
     for row, (stage, seconds) in enumerate(timings_s.items()):
         y = 6 + row * step
-        out.append(_label(left - 10, y + 15, stage, "end", "name"))
+        out.append(
+            _label(0, y + 8, stage, "start", "name") if above else _label(left - 10, y + 15, stage, "end", "name")
+        )
+        y += 14 if above else 0
         out.append(f'<rect class="bar" x="{left}" y="{y}" width="{bar * seconds / longest:.1f}" height="20" rx="3"/>')
         text = f"{seconds:.1f} s · {100 * seconds / total:.0f} %"
         out.append(_label(left + bar * seconds / longest + 8, y + 15, text, "start"))
-    return _svg(len(timings_s) * step + 8, out, "seconds of each stage")
+    return _svg(width, len(timings_s) * step + 8, out, "seconds of each stage")
 
 
 def ground_axes(trajectory: Trajectory, positions: Array) -> Array:
@@ -165,10 +186,10 @@ def error_colour(ratio: float) -> str:
     return f"rgb({r},{g},{b})"
 
 
-def _svg(height: float, parts: Sequence[str], title: str) -> str:
+def _svg(width: int, height: float, parts: Sequence[str], title: str) -> str:
     body = "".join(parts)
-    svg = f'<svg viewBox="0 0 {WIDTH} {height:.0f}" role="img" aria-label="{title}">{body}</svg>'
-    return f'<div class="plot">{svg}</div>'
+    svg = f'<svg viewBox="0 0 {width} {height:.0f}" role="img" aria-label="{title}">{body}</svg>'
+    return f'<div class="plot {"wide" if width == WIDTH else "narrow"}">{svg}</div>'
 
 
 def _label(x: float, y: float, text: str, anchor: str, kind: str = "tick") -> str:
@@ -182,7 +203,7 @@ def _dot(point: Array, kind: str, radius: float) -> str:
 def _grid(bounds: tuple[Array, Array], place: Any, frame: tuple[float, float, float, float]) -> list[str]:
     (low, high), (left, right, top, bottom) = bounds, frame
     span = float((high - low).max())
-    step_count = 8
+    step_count = 8 if right - left > WIDTH / 2 else 3
     out: list[str] = []
     step = ticks(0, span, step_count)[1]
     for axis in (0, 1):
@@ -205,7 +226,8 @@ def _lines(xy: Array, valid: Array, kind: str) -> list[str]:
 
 
 def _polyline(xy: Array, kind: str) -> str:
-    step = max(1, math.ceil(len(xy) / MAX_POINTS))
+    room = float(np.clip(np.ptp(xy, 0).max() / WIDTH, LEAST_POINTS, 1)) if len(xy) else 1.0
+    step = max(1, math.ceil(len(xy) / (MAX_POINTS * room)))
     kept = xy[::step] if (len(xy) - 1) % step == 0 else np.concatenate([xy[::step], xy[-1:]])
     points = " ".join(f"{x:.1f},{y:.1f}" for x, y in kept)
     return f'<polyline class="path {kind}" points="{points}"/>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +60,12 @@ def read_cloud(path: Path) -> StaticCloud:
     missing = [name for name in VERTEX.names or () if name not in (rows.dtype.names or ())]
     if missing:
         raise InputError(f"{path}: expected vertex properties {', '.join(missing)}, got {rows.dtype.names}")
-    points = np.stack([rows[name] for name in "xyz"], -1).astype(np.float32)
-    colors = np.stack([rows[name] for name in ("red", "green", "blue")], -1)
     return StaticCloud(
-        points, colors, rows["confidence"].copy(), rows["spacing"].copy(), rows["keyframe"].astype(np.int32)
+        _stacked(rows, "xyz"),
+        vertex_colors(rows),
+        rows["confidence"].copy(),
+        rows["spacing"].copy(),
+        rows["keyframe"].astype(np.int32),
     )
 
 
@@ -71,11 +74,51 @@ def read_points(path: Path) -> Array:
     rows = read_vertices(path)
     if not set("xyz") <= set(rows.dtype.names or ()):
         raise InputError(f"{path}: expected vertex properties x, y, z, got {rows.dtype.names}")
-    return np.stack([rows[name] for name in "xyz"], -1).astype(np.float32)
+    return _stacked(rows, "xyz")
+
+
+def read_coloured_points(path: Path) -> tuple[Array, Array, Array | None]:
+    """Points (n, 3) float32, colours (n, 3) uint8 and, where the file tells it, the spacing (n,) of a cloud.
+
+    White where it has no colours. Raises InputError.
+    """
+    rows = read_vertices(path)
+    names = set(rows.dtype.names or ())
+    if not set("xyz") <= names:
+        raise InputError(f"{path}: expected vertex properties x, y, z, got {rows.dtype.names}")
+    return _stacked(rows, "xyz"), vertex_colors(rows), rows["spacing"].copy() if "spacing" in names else None
+
+
+def vertex_colors(rows: Array) -> Array:
+    """(n, 3) uint8 RGB of vertices; white where they have none."""
+    if not {"red", "green", "blue"} <= set(rows.dtype.names or ()):
+        return np.full((len(rows), 3), 255, np.uint8)
+    return np.stack([rows[name] for name in ("red", "green", "blue")], -1).astype(np.uint8)
+
+
+def _stacked(rows: Array, names: str) -> Array:
+    return np.stack([rows[name] for name in names], -1).astype(np.float32)
 
 
 def read_vertices(path: Path) -> Array:
     """The vertices of a little-endian PLY, (n,) structured by property name. Raises InputError."""
+    elements, body = read_ply(path)
+    if [e.name for e in elements] != ["vertex"]:
+        raise InputError(f"{path}: expected vertices only, got {', '.join(e.name for e in elements) or 'nothing'}")
+    return vertices_of(path, elements[0], body)
+
+
+@dataclass(frozen=True)
+class Element:
+    """What a PLY header says of one kind of rows."""
+
+    name: str
+    count: int
+    properties: tuple[tuple[str, ...], ...]  # words after "property"
+
+
+def read_ply(path: Path) -> tuple[list[Element], bytes]:
+    """The header of a little-endian PLY, and what follows it. Raises InputError."""
     try:
         data = path.read_bytes()
     except OSError as e:
@@ -84,12 +127,25 @@ def read_vertices(path: Path) -> Array:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not mark or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
         raise InputError(f"{path}: expected a binary little-endian PLY, got {data[:40]!r}")
-    elements = [line for line in lines if line[:1] == ["element"]]
-    properties = [line for line in lines if line[:1] == ["property"]]
-    if [e[1] for e in elements] != ["vertex"] or any(len(p) != 3 or p[1] not in PLY_TYPE for p in properties):
-        raise InputError(f"{path}: expected vertices with plain properties only, got {elements}")
-    dtype = np.dtype([(name, PLY_TYPE[kind]) for _, kind, name in properties])
-    count = int(elements[0][2])
-    if len(body) < count * dtype.itemsize:
-        raise InputError(f"{path}: expected {count * dtype.itemsize} bytes of vertices, got {len(body)}")
-    return np.frombuffer(body, dtype, count)
+    elements: list[Element] = []
+    for words in lines[2:]:
+        if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+            elements.append(Element(words[1], int(words[2]), ()))
+        elif words[:1] == ["property"] and len(words) > 2 and elements:
+            elements[-1] = replace(elements[-1], properties=(*elements[-1].properties, tuple(words[1:])))
+        elif words[:1] not in (["comment"], ["obj_info"], []):
+            raise InputError(f"{path}: expected elements and properties in the header, got {' '.join(words)[:60]!r}")
+    return elements, body
+
+
+def vertices_of(path: Path, element: Element, body: bytes) -> Array:
+    """The rows of an element of plain properties that ``body`` begins with, structured. Raises InputError."""
+    if any(len(p) != 2 or p[0] not in PLY_TYPE for p in element.properties):
+        raise InputError(f"{path}: expected vertices with plain properties only, got {element.properties}")
+    names = [name for _, name in element.properties]
+    if len(set(names)) < len(names):
+        raise InputError(f"{path}: expected every vertex property once, got {', '.join(names)}")
+    dtype = np.dtype([(name, PLY_TYPE[kind]) for kind, name in element.properties])
+    if len(body) < element.count * dtype.itemsize:
+        raise InputError(f"{path}: expected {element.count * dtype.itemsize} bytes of vertices, got {len(body)}")
+    return np.frombuffer(body, dtype, element.count)

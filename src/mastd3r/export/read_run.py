@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -90,7 +90,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def _states(runs: Any, trajectory: Trajectory, folder: Path) -> tuple[State, ...]:
-    states = tuple(state for state, count in runs for _ in range(count))
+    try:
+        states: tuple[State, ...] = tuple(state for state, count in runs for _ in range(count))
+    except (TypeError, ValueError) as e:
+        raise InputError(f"{folder}/run.json: expected states as [state, count] pairs, got {str(runs)[:60]}") from e
+    if not set(states) <= set(get_args(State)):
+        raise InputError(f"{folder}/run.json: expected states {', '.join(get_args(State))}, got {set(states)}")
     if len(states) != len(trajectory.timestamps_s):
         raise InputError(
             f"{folder}/run.json: expected states of {len(trajectory.timestamps_s)} poses, got {len(states)}"

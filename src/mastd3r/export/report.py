@@ -1,4 +1,4 @@
-"""report.html: one page that shows a run, pictures first. It needs no network and no other file."""
+"""report.html: one page that shows a run, pictures first. It needs no network; videos and links need its folder."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ from .evidence import FULL_SCALE_LOG, EvidenceSample, panel
 from .files import write_text
 from .metric_names import described, in_order, shown, summary_line
 from .pictures import DIFFERENCE_FULL_SCALE, data_uri, difference, fitted, mask_overlay
-from .plots import over_time, timing_bars, top_view
+from .plots import NARROW, WIDTH, over_time, timing_bars, top_view
+from .report_files import RunFile, size_shown
 
 Array = NDArray[Any]
 OVERLAY_WIDTH_PX = 480
@@ -60,6 +62,7 @@ class ReportData:
     record: Mapping[str, Any]  # run.json
     config: str  # YAML text
     evidence: EvidenceSample | None = None
+    files: tuple[RunFile, ...] = ()  # of the run folder, which the page lies in
 
 
 def write_report(run_dir: Path, data: ReportData) -> Path:
@@ -73,6 +76,7 @@ def report_html(data: ReportData) -> str:
     """The page as text."""
     template = Template(files(__package__).joinpath("report_template.html").read_text(encoding="utf-8"))
     sections = [
+        _videos(data),
         _renders(data.renders),
         _masks(data.masks),
         _evidence(data.evidence),
@@ -80,6 +84,7 @@ def report_html(data: ReportData) -> str:
         _numbers(data.metrics, data.record.get("camera") or {}),
         _timings(data.record.get("timings_s") or {}),
         _choices(data),
+        _files(data.files),
     ]
     return template.substitute(
         title=escape(data.title),
@@ -112,6 +117,37 @@ def _scale_bar(kind: str, high: str) -> str:
     return f'<span class="nowrap">0<span class="{kind}"></span>{high}</span>'
 
 
+def _videos(data: ReportData) -> str:
+    """The run's videos, which lie beside the page; a picture stands for one until it plays, or if it is not there."""
+    here = {file.name for file in data.files}
+    render = data.renders[0].splat if data.renders else None
+    overlay = _overlay(data.masks[0]) if data.masks else None
+    known = (
+        ("flight.mp4", "flight through the splat, along the smoothed path", render, "autoplay loop"),
+        ("masks.mp4", "what moves, over the frames", overlay, "loop"),
+    )
+    figures = []
+    for name, words, poster, how in known:
+        if name in here:
+            still = "" if poster is None else f' poster="{data_uri(poster)}"'
+            video = f'<video src="{name}" controls muted playsinline preload="metadata" {how}{still}></video>'
+            figures.append(f"<figure>{video}<figcaption>{words}</figcaption></figure>")
+    return f'<section class="first"><div class="row videos">{"".join(figures)}</div></section>' if figures else ""
+
+
+def _files(files: Sequence[RunFile]) -> str:
+    """Links to all that lies beside the page."""
+    rows = []
+    for f in files:
+        address, known = quote(f.name) + ("" if f.count is None else "/"), "known" if f.words else ""
+        link = f'<a class="{known}" href="{address}">{escape(f.name)}</a>'
+        rows.append(
+            f'<tr><td>{link}</td><td class="words">{escape(f.words)}</td><td class="value">{size_shown(f)}</td></tr>'
+        )
+    text = "Links lead to what lies beside this page in its run folder."
+    return _section("Files", text, f"<table>{''.join(rows)}</table>") if rows else ""
+
+
 def _renders(samples: Sequence[RenderSample]) -> str:
     if not samples:
         return ""
@@ -134,12 +170,16 @@ def _renders(samples: Sequence[RenderSample]) -> str:
     return _section("Photograph, splat, difference", text, "".join(rows))
 
 
+def _overlay(sample: MaskSample) -> Array:
+    return mask_overlay(fitted(sample.image, OVERLAY_WIDTH_PX), sample.probability)
+
+
 def _masks(samples: Sequence[MaskSample]) -> str:
     if not samples:
         return ""
     figures = []
     for s in samples:
-        picture = mask_overlay(fitted(s.image, OVERLAY_WIDTH_PX), s.probability)
+        picture = _overlay(s)
         ratio = float((s.probability > 127).mean())
         caption = f"<b>{s.timestamp_s:.3f} s</b> · {ratio:.1%} called moving"
         figures.append(_figure(picture, caption, f"P(moving) over the frame at {s.timestamp_s:.3f} s"))
@@ -171,7 +211,8 @@ def _trajectory(data: ReportData) -> str:
     else:
         text += "A single camera cannot tell the scale: lengths are map units."
     legend = _legend(data, error is not None)
-    return _section("Trajectory", text, top_view(*shared) + over_time(*shared) + legend)
+    plots = "".join(plot(*shared, width=width) for plot in (top_view, over_time) for width in (WIDTH, NARROW))
+    return _section("Trajectory", text, plots + legend)
 
 
 def _legend(data: ReportData, has_truth: bool) -> str:
@@ -219,7 +260,8 @@ def _of_focal(camera: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def _timings(timings_s: Mapping[str, float]) -> str:
-    return _section("Time of each stage", "", timing_bars(dict(timings_s))) if timings_s else ""
+    plots = "".join(timing_bars(dict(timings_s), width) for width in (WIDTH, NARROW))
+    return _section("Time of each stage", "", plots) if timings_s else ""
 
 
 def _choices(data: ReportData) -> str:

@@ -13,6 +13,7 @@ from ..types import Frame
 from .evidence import EvidenceSample
 from .read_run import Run
 from .report import MaskSample, RenderSample, ReportData
+from .report_files import run_files
 from .run_folder import stamp
 
 Array = NDArray[Any]
@@ -62,6 +63,7 @@ def gather_report_data(
         record=run.record,
         config=run.config,
         evidence=evidence,
+        files=run_files(run.path),
     )
 
 

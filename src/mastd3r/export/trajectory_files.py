@@ -62,6 +62,17 @@ def read_trajectory(path: Path, kind: str, times_s: Array) -> Trajectory:
     return found
 
 
+def read_states(path: Path) -> list[tuple[float, State]]:
+    """(timestamp_s, state) of every frame, as a run folder's states.txt has them. Raises InputError."""
+    rows: list[tuple[float, State]] = []
+    for number, line in _lines(path):
+        words = line.split()
+        if len(words) != 2 or words[1] not in get_args(State):
+            raise InputError(f"{path} line {number}: expected a time and a state, got {line[:60]!r}")
+        rows.append((_floats(path, number, line, words[:1])[0], words[1]))  # type: ignore[arg-type]
+    return rows
+
+
 def _read_kitti(path: Path, times_s: Array) -> Trajectory:
     rows: list[list[float]] = []
     for number, line in _lines(path):

@@ -12,25 +12,13 @@ from numpy.typing import NDArray
 from ..geometry.quaternion import quaternion_from_rotation
 from ..geometry.sim3 import Sim3
 from ..registry import AUTO
+from .gaussian_arrays import GaussianArrays
 from .rasterise import rasterization
 from .screen import ScreenStats
 from .sh import sh_turned, view_colors
 
 Array = NDArray[Any]
 PARAMETERS = ("means", "log_scales", "quats", "opacity_logits", "colors", "sh_rest")
-
-
-@dataclass(frozen=True)
-class GaussianArrays:
-    """The map for export, in plain numbers."""
-
-    means: Array  # (n, 3) float32, world
-    scales: Array  # (n, 3) float32, standard deviations in map units
-    quats: Array  # (n, 4) float32 wxyz, unit length
-    opacities: Array  # (n,) float32 0..1
-    colors: Array  # (n, 3) float32 RGB, 0..1
-    kf_id: Array  # (n,) int32
-    sh_rest: Array  # (n, K - 1, 3) float32, spherical harmonics above the constant one; K = 1, 4, 9 or 16
 
 
 @dataclass

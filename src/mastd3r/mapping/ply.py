@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, OutputError
-from .gaussians import GaussianArrays
+from .gaussian_arrays import GaussianArrays
 
 SH_DC = 0.28209479177387814  # first spherical harmonic
 _OF_REST = {0: 0, 9: 3, 24: 8, 45: 15}  # number of f_rest columns -> upper coefficients a channel
@@ -60,8 +60,9 @@ def read_gaussians_ply(path: Path) -> GaussianArrays:
         raise InputError(f"{path}: expected a readable .ply, got {e}") from e
     head, mark, body = data.partition(b"end_header\n")
     lines = head.decode("ascii", "replace").split("\n")
-    counts = [int(line.split()[2]) for line in lines if line.startswith("element vertex ")]
-    names = tuple(line.split()[2] for line in lines if line.startswith("property float "))
+    words = [line.split() for line in lines]
+    counts = [int(w[2]) for w in words if w[:2] == ["element", "vertex"] and len(w) == 3 and w[2].isdecimal()]
+    names = tuple(w[2] for w in words if w[:2] == ["property", "float"] and len(w) == 3)
     rest = sum(name.startswith("f_rest_") for name in names)
     known = rest in _OF_REST and names == _names(rest)
     if not mark or "format binary_little_endian 1.0" not in lines or len(counts) != 1 or not known:

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..errors import OutputError
-from .gaussians import GaussianArrays
+from .gaussian_arrays import GaussianArrays
 from .ply import SH_DC
 from .sh import sh_basis, sh_degree
 

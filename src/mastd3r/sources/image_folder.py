@@ -6,6 +6,9 @@ import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
@@ -18,6 +21,7 @@ from .notes import Notes
 from .photographs import Photographs
 from .semantic_maps import match_maps
 
+Array = NDArray[Any]
 log = logging.getLogger(__name__)
 FOLDER_FPS = 30.0  # image files carry no times; one thirtieth of a second a frame is assumed
 
@@ -83,6 +87,10 @@ class ImageFolderSource:
             given += 1
             yield Frame(i, i / FOLDER_FPS, image, semantic=semantic)
         self.length = given
+
+    def image_at(self, timestamp_s: float) -> Array | None:
+        """One photograph by its time, see ``Photographs.at``."""
+        return self._photographs.at({i: i / FOLDER_FPS for i in self._chosen}, timestamp_s)
 
     def truth(self) -> Truth | None:
         """A folder of images knows nothing about itself."""

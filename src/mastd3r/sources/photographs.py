@@ -16,6 +16,7 @@ from .image_files import BrokenFile, read_grey_levels, read_rgb
 from .notes import Notes
 
 Array = NDArray[Any]
+SAME_TIME_S = 1.5e-6  # run folders write six decimals
 
 
 class Photographs:
@@ -46,6 +47,15 @@ class Photographs:
                 continue
             check_same_size(image, str(path), self.size, self._first)
             yield i, image
+
+    def at(self, times_s: Mapping[int, float], timestamp_s: float) -> Array | None:
+        """(h, w, 3) uint8 RGB of the frame at a time, to a microsecond; None where there is none.
+
+        ``times_s``: of every frame, by its index. Raises InputError for a broken file.
+        """
+        found = (i for i, t in times_s.items() if abs(t - timestamp_s) < SAME_TIME_S)
+        index = next(found, None)
+        return None if index is None else read_rgb(self._files[index], self._grey_range)
 
     def _first_readable(self) -> tuple[int, Array]:
         reason = InputError("expected images, got none")

@@ -107,6 +107,10 @@ class SequenceSource:
             yield Frame(i, listed.timestamp_s, image, depth, semantic)
         self.length = given
 
+    def image_at(self, timestamp_s: float) -> Array | None:
+        """One photograph by its time, see ``Photographs.at``."""
+        return self._photographs.at({i: self._found.frames[i].timestamp_s for i in self._chosen}, timestamp_s)
+
     def truth(self) -> Truth | None:
         """Camera poses and focal length; None where the dataset has neither."""
         found = self._found

@@ -114,6 +114,10 @@ class TumSource:
             yield Frame(i, float(self._times[i]), image, depth, semantic)
         self.length = given
 
+    def image_at(self, timestamp_s: float) -> Array | None:
+        """One photograph by its time, see ``Photographs.at``."""
+        return self._photographs.at({i: float(self._times[i]) for i in self._chosen}, timestamp_s)
+
     def truth(self) -> Truth | None:
         """Poses of groundtruth.txt, masks of mask.txt, focal length of info.json. Raises InputError.
 

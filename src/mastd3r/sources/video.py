@@ -145,6 +145,24 @@ class VideoSource:
             yield Frame(d.index, d.timestamp_s, image, semantic=semantic)
         self.length = given
 
+    def image_at(self, timestamp_s: float) -> Array | None:
+        """One frame by its time, (h, w, 3) uint8 RGB, the nearest of the file; None where none decodes.
+
+        It is decoded from the key frame before it; fields of interlaced video are not taken apart.
+        """
+        contents = self._contents
+        at = int(np.abs(contents.times_s - timestamp_s).argmin())
+        with _opened(self._path) as (container, stream):
+            try:
+                if contents.timed:
+                    container.seek(int(contents.times_s[at] / stream.time_base), stream=stream)
+                for counted, frame in enumerate(container.decode(stream)):
+                    if self._placed(frame, counted).index >= at:
+                        return self._rgb(frame)
+            except av.FFmpegError:
+                return None
+        return None
+
     def truth(self) -> Truth | None:
         """A video knows nothing about itself."""
         return None

@@ -1,0 +1,23 @@
+"""The Gaussian map in plain numbers, as files hold it; needs no torch, which takes seconds to load."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class GaussianArrays:
+    """The map for export, in plain numbers."""
+
+    means: Array  # (n, 3) float32, world
+    scales: Array  # (n, 3) float32, standard deviations in map units
+    quats: Array  # (n, 4) float32 wxyz, unit length
+    opacities: Array  # (n,) float32 0..1
+    colors: Array  # (n, 3) float32 RGB, 0..1
+    kf_id: Array  # (n,) int32
+    sh_rest: Array  # (n, K - 1, 3) float32, spherical harmonics above the constant one; K = 1, 4, 9 or 16
