@@ -35,6 +35,8 @@ NAMES: dict[str, tuple[str, str, str]] = {
     "mask_moving_ratio": ("Pixels called moving", ".2%", ""),
     "fps_tracking": ("Tracking speed", ".2f", "frames/s"),
     "fps_total": ("Speed of the whole run", ".2f", "frames/s"),
+    "core_s_per_frame_tracking": ("Processor time of all threads a frame, tracking", ".3f", "s"),
+    "core_s_per_frame": ("Processor time of all threads a frame, all stages", ".3f", "s"),
     "peak_rss_mib": ("Peak memory", ".0f", "MiB"),
     "peak_gpu_mib": ("Peak memory of the accelerator", ".0f", "MiB"),
     "focal_px": ("Focal length at full width", ".1f", "px"),

@@ -66,6 +66,7 @@ class RunJob:
         self.frames = 0  # that were tracked
         self.metrics: dict[str, Any] = {}
         self.timings: dict[str, float] = {}
+        self.processor_s: dict[str, float] | None = {}  # of all threads; None: part of it was another process's
         self._began = time.perf_counter()
         self._final: list[FinalFrame] = []
         self._turns_only = False  # the camera has one place: there is no depth
@@ -106,7 +107,7 @@ class RunJob:
 
     def already_tracked(self, frames: int, seconds: float) -> None:
         """So many frames were tracked, in so long, before this job began: they count as its own."""
-        self.frames, self.timings["tracking"] = frames, seconds
+        self.frames, self.timings["tracking"], self.processor_s = frames, seconds, None
         self._began -= seconds
 
     def check_tracked(self) -> None:
@@ -239,6 +240,9 @@ class RunJob:
             "fps_total": self.frames / elapsed,
             "peak_rss_mib": peak_rss_mib(),
         }
+        if self.processor_s is not None:
+            self.metrics["core_s_per_frame_tracking"] = self.processor_s["tracking"] / self.frames
+            self.metrics["core_s_per_frame"] = sum(self.processor_s.values()) / self.frames
         if (sigma_ratio := self.folder.record["camera"]["focal_sigma_ratio"]) is not None:
             self.metrics["focal_sigma_ratio"] = sigma_ratio
         if (card := accelerator()) is not None:
@@ -260,13 +264,16 @@ class RunJob:
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         """Adds what the block takes to the stage's seconds in run.json."""
-        began = time.perf_counter()
+        began, busy = time.perf_counter(), time.process_time()
         try:
             yield
             log.info("%s: %.1f s", stage, time.perf_counter() - began)
         finally:
             self.timings[stage] = self.timings.get(stage, 0.0) + time.perf_counter() - began
             self.folder.record["timings_s"] = self.timings
+            if self.processor_s is not None:
+                self.processor_s[stage] = self.processor_s.get(stage, 0.0) + time.process_time() - busy
+                self.folder.record["processor_s"] = self.processor_s
 
     def _turn_upright(self) -> None:
         """The world with gravity along +y, as viewers of splats expect it of such files."""
