@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .config import Config
     from .errors import ConfigError, InputError, MissingPackage, OutputError, SlamError
-    from .offline.reconstruction import Reconstruction
     from .live.loop import LiveFrame, LiveLoop
     from .live.run import run_live
+    from .offline.reconstruction import Reconstruction
     from .pipeline import evaluate_trajectory, finish_live, load, reconstruct
-    from .sources.camera import CameraOptions, open_camera
     from .slam import Slam, TrackResult
+    from .sources.camera import CameraOptions, open_camera
     from .tracking.state import Status
 
 __version__ = "0.1.0"

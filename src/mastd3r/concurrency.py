@@ -21,10 +21,13 @@ C = TypeVar("C")
 
 
 class Future(Generic[T]):
-    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised."""
+    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised.
 
-    def __init__(self, get: Callable[[], T]) -> None:
-        self.get = get
+    ``ready`` says whether it is there; who goes by that has results that depend on the machine's speed.
+    """
+
+    def __init__(self, get: Callable[[], T], ready: Callable[[], bool] = lambda: True) -> None:
+        self.get, self.ready = get, ready
 
     @staticmethod
     def done(value: T) -> Future[T]:
@@ -54,7 +57,8 @@ class Worker:
 
     def submit(self, make: Callable[[], T]) -> Future[T]:
         """The value of ``make``, made there."""
-        return Future(self._pool.submit(make).result)
+        made = self._pool.submit(make)
+        return Future(made.result, made.done)
 
     def close(self) -> None:
         """Wait for all that was given to it, and end it."""

@@ -103,9 +103,9 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
 def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconstruction:
     """The rest of a live run that kept its frames, as ``mastd3r finish``: masks both ways, cloud, map, report.
 
-    It goes on from the end of the live run, or tracks the kept frames once more where that was killed, or made by
-    another version: the trajectory is that of ``reconstruct`` over them. Raises InputError for a folder that holds no
-    such run, or one that is finished; otherwise as ``reconstruct``.
+    All frames that came are tracked once more, without hurry: the trajectory is that of ``reconstruct`` over them.
+    Stopped, it goes on where it was. Raises InputError for a folder that holds no such run, or one that is finished;
+    otherwise as ``reconstruct``.
     """
     path = Path(run).expanduser()
     if not (path / "run.json").is_file() and stopped_run(path) is None:
@@ -113,7 +113,7 @@ def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconst
     at = stopped_run(path) or path
     record = read_json(at / "run.json")
     if not record.get("live"):
-        raise InputError(f"{at}: expected a live run, got one of files; mastd3r resume goes on with one that was stopped")
+        raise InputError(f"{at}: expected a live run, got one of files; mastd3r resume goes on with those")
     if not record["live"].get("recorded") or not (at / RECORDED / RECORDED_LIST).is_file():
         raise InputError(f"{at}: expected a live run that kept its frames (--record), got one that let them pass")
     if record.get("status") == "complete" and "masks" in record.get("timings_s", {}):

@@ -14,14 +14,12 @@ from ..evaluation.evaluate import Evaluation
 from ..export.live_files import LiveFiles
 from ..export.machine import peak_rss_mib
 from ..export.run_folder import RunFolder
-from ..offline.checkpoints import Checkpoints
 from ..offline.job import RunJob
 from ..offline.run_report import write_run_report
 from ..offline.tracked import Tracked
 from ..offline.tracks import static_tracks
 from ..progress import Reporter
 from ..sources.passing import KeptSource, PassingSource
-from ..types import Frame
 from .loop import LiveFrame, LiveLoop
 
 LATE = 8  # frames whose files may be in the making: a slow disk makes the camera faster than tracking, nothing more
@@ -38,20 +36,19 @@ class LiveJob(RunJob):
         self.loop = loop
         self.latencies_s: list[tuple[float, float]] = []  # of every frame: to its pose, to its mask as well
         self._files = LiveFiles(folder.path)
-        self._worker, self._recorder = Worker("live files"), Worker("recording")
+        self._worker = Worker("live files")
         self._written = deque[Future[None]]()
         self._moving: list[float] = []  # share of each mask
         self._arrived_s: list[float] = []
+
+    def __enter__(self) -> LiveJob:
+        return self
 
     def see(self, seen: LiveFrame) -> None:
         """One frame has been tracked: its files. Raises OutputError for those of an earlier one."""
         self.frames += 1
         self._arrived_s.append(seen.arrived_s)
         self._written.append(self._worker.submit(lambda: self._write(seen)))
-        source = self.source
-        if isinstance(source, KeptSource):
-            frame = Frame(seen.result.index, seen.timestamp_s, seen.image)
-            self._written.append(self._recorder.submit(lambda: source.keep(frame)))
         while len(self._written) > LATE:
             self._written.popleft().get()
 
@@ -67,6 +64,8 @@ class LiveJob(RunJob):
         while self._written:
             self._written.popleft().get()
         self._files.close()
+        if isinstance(self.source, KeptSource):
+            self.source.settle()
 
     def end(self) -> None:
         """Everything that is cheap: joint optimisation and all poses, the cloud, figures, the report; complete."""
@@ -85,9 +84,6 @@ class LiveJob(RunJob):
             px = self.tracked.photograph_px
             self.folder.write_tracks(static_tracks(self.graph, self._final, colors, moving, px))
         self._report()
-        if isinstance(self.source, KeptSource):  # the frames can be read again: ``finish`` goes on from here
-            self.checkpoints = Checkpoints(self.folder.path)
-            self.keep("solved", loop.slam.memory)
 
     def facts(self) -> dict[str, Any]:
         """How the live part went, for run.json."""
@@ -126,9 +122,7 @@ class LiveJob(RunJob):
         self.latencies_s.append((seen.pose_latency_s, seen.latency_s))
         self._files.pose(seen.timestamp_s, seen.world_from_cam)
         words = (seen.state, int(result.is_keyframe), result.submap, seen.dropped)
-        self._files.frame(
-            seen.timestamp_s, *words, 1e3 * seen.pose_latency_s, 1e3 * seen.latency_s, result.reason
-        )
+        self._files.frame(seen.timestamp_s, *words, 1e3 * seen.pose_latency_s, 1e3 * seen.latency_s, result.reason)
         small = cv2.resize(moving, self.graph.size, interpolation=cv2.INTER_LINEAR)
         self._moving.append(float((small > 0.5).mean()))
         self.folder.write_mask(seen.timestamp_s, np.asarray(small))
@@ -159,8 +153,7 @@ class LiveJob(RunJob):
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with undivided():
-            for worker in (self._worker, self._recorder):
-                worker.close()
+            self._worker.close()
             if error is not None and self.folder.record["status"] == "running":
                 self.folder.record["live"] = self.facts()
             super().__exit__(kind, error, trace)

@@ -17,8 +17,8 @@ from ..geometry.se3 import inverse
 from ..offline.causal_cloud import CausalCloud
 from ..parts import with_dataset_lens
 from ..slam import Slam, TrackResult
-from ..sources.camera import Camera
-from ..sources.passing import PassingSource
+from ..sources.camera import Camera, CameraFrame
+from ..sources.passing import KeptSource, PassingSource
 from ..sources.rectified import rectified
 from ..tracking.state import Status
 from ..types import Frame, StaticCloud
@@ -91,12 +91,12 @@ class LiveLoop:
         config, self.notes = with_dataset_lens(config, source)
         self.camera, self.source, self._seconds, self.on_frame = camera, source, seconds, on_frame
         self.while_silent: Callable[[], None] = lambda: None  # called now and then while no frame comes
-        self.slam = Slam(config, source.size, source=source)
+        self.slam = Slam(config, source.size, source=source, live=True)
         self.said: list[str] = []  # what happened, a line each
         self.ended: str | None = None  # why, once it has
         self.state = "waiting"  # for people: of the camera while nothing comes, else of tracking
         self.tracked, self.tracking_s = 0, 0.0
-        self._slot: Newest[Any] | None = None
+        self._slot: Newest[CameraFrame] | None = None
         self._out = Worker("live masks")
         self.keyframes = CausalCloud(self.slam.graph)
         self._stopped = False
@@ -118,7 +118,7 @@ class LiveLoop:
         return 0 if self._slot is None else self._slot.dropped
 
     def __iter__(self) -> Iterator[LiveFrame]:
-        self._slot = slot = Newest(self.camera.frames(), "camera")
+        self._slot = slot = Newest(self._frames(), "camera")
         dropped, last = 0, time.perf_counter()
         first: float | None = None
         while not self._stopped:
@@ -136,9 +136,10 @@ class LiveLoop:
                 self.while_silent()
                 continue
             first = came.arrived_s if first is None else first
+            before, dropped = dropped, slot.dropped
             with undivided():
-                seen = self._track(came, slot.dropped - dropped)
-            dropped, last = slot.dropped, time.perf_counter()
+                seen = self._track(came, dropped - before)
+            last = time.perf_counter()
             yield seen
         self.said += self.camera.said[len(self.said) :]
         self.ended = self.ended or "the camera ended"
@@ -167,7 +168,14 @@ class LiveLoop:
             return np.zeros((0, 4, 4))
         return np.stack([inverse(r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world) for r in placed])
 
-    def _track(self, came: Any, dropped: int) -> LiveFrame:
+    def _frames(self) -> Iterator[CameraFrame]:
+        """In the camera's thread: what comes, kept where that is wanted."""
+        for came in self.camera.frames():
+            if isinstance(self.source, KeptSource):
+                self.source.keep(came)
+            yield came
+
+    def _track(self, came: CameraFrame, dropped: int) -> LiveFrame:
         frame = Frame(self.tracked, came.timestamp_s, came.image)
         if self.slam.rectifier is not None:
             frame = rectified(frame, self.slam.rectifier)

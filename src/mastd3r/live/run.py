@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..concurrency import one_blas_thread
@@ -125,6 +126,6 @@ class _Teller:
             log.warning(line)
         self._said = len(loop.said)
         median, most = self._job.latency_ms()
-        late = "" if median != median else f" · latency {median:.0f} ms (95 %: {most:.0f})"
+        late = "" if np.isnan(median) else f" · latency {median:.0f} ms (95 %: {most:.0f})"
         share = loop.dropped / max(loop.came, 1)
         self._bar.say(f"{loop.state}{late} · dropped {loop.dropped} of {loop.came} ({share:.1%})")

@@ -17,7 +17,7 @@ Array = NDArray[Any]
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 DEVICE = re.compile(r"\d+|/dev/.+")
 TIMEOUT_S = 10.0
-EXPECTED = "a camera's number, a device, a URL (rtsp, http, udp, ...), - for frames on standard input, a ROS bag or MCAP"
+EXPECTED = "a camera's number, a device, a URL (rtsp, http, udp, ...), - for frames on standard input, a ROS bag"
 
 
 @dataclass(frozen=True)

@@ -36,15 +36,16 @@ class _Device:
     """The camera, opened."""
 
     def __init__(self, device: str) -> None:
-        before = cv2.setLogLevel(0)  # what is wrong is said by us, in one line
+        said = cv2.utils.logging  # type: ignore[attr-defined]
+        before = said.setLogLevel(said.LOG_LEVEL_SILENT)  # what is wrong is said by us, in one line
         try:
             self._capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
         finally:
-            cv2.setLogLevel(before)
+            said.setLogLevel(before)
         there, image = self._capture.read() if self._capture.isOpened() else (False, None)
         if not there or image is None:
             self._capture.release()
-            raise InputError(f"camera {device}: expected a camera that gives pictures, got none; is it plugged in, free?")
+            raise InputError(f"camera {device}: expected a camera that gives pictures, got none; is it there and free?")
         self._capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)  # the newest picture, not the oldest that waits
         self.size = (image.shape[1], image.shape[0])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from numpy.typing import NDArray
@@ -14,14 +14,13 @@ from .camera import CameraFrame, microseconds
 Array = NDArray[Any]
 
 
-def paced(items: Iterator[tuple[float, Callable[[], Array]]], fps: float | None = None) -> Iterator[CameraFrame]:
-    """(seconds, what makes the image) at the pace of their times, or ``fps`` a second; the next is made meanwhile.
+def paced(items: Iterator[tuple[float, Array]], fps: float | None = None) -> Iterator[CameraFrame]:
+    """(seconds, image) at the pace of their times, or ``fps`` a second; the next is made meanwhile.
 
     The clock starts with the first. A frame that is made too late comes late: it has arrived when it is there.
     """
     began = first_s = 0.0
-    for n, (time_s, image_of) in enumerate(items):
-        image = image_of()
+    for n, (time_s, image) in enumerate(items):
         now = time.perf_counter()
         if n == 0:
             began, first_s = now, time_s
@@ -46,7 +45,7 @@ class PacedSource:
 
     def frames(self) -> Iterator[CameraFrame]:
         """Frame after frame. Raises InputError as the source does."""
-        return paced(((f.timestamp_s, lambda f=f: f.image) for f in self._source.frames()), self._fps)
+        return paced(((f.timestamp_s, f.image) for f in self._source.frames()), self._fps)
 
     def close(self) -> None:
         """Nothing is held."""

@@ -1,20 +1,23 @@
-"""Frames of a camera as a source: passing by, or kept as they were tracked."""
+"""Frames of a camera as a source: passing by, or kept."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from ..concurrency import Future, Worker
 from ..config import SourceConfig
 from ..errors import OutputError
 from ..types import Frame, Truth
-from .camera import Camera
+from .camera import Camera, CameraFrame
 from .open import open_source
 
-LIST = "rgb.txt"
+LIST, HELD = "rgb.txt", 30  # frames that may wait to be written
 
 
 class PassingSource:
@@ -39,33 +42,53 @@ class PassingSource:
 
 
 class KeptSource(PassingSource):
-    """Frames kept as PNG files with their times in rgb.txt: exact pixels, a TUM-layout folder that anybody can read.
+    """Every frame that comes kept as a PNG file with its time in rgb.txt: a TUM-layout folder that anybody can read.
 
-    ``keep`` may be called from another thread; what it has returned from is whole, whatever happens afterwards.
+    Written by a thread of its own. A disk that is slower than the camera holds the camera up, not this memory.
     """
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__(camera)
+        self.folder: Path | None = None
+        self._worker, self._late = Worker("recording"), deque[Future[None]]()
 
     def begin(self, folder: Path) -> None:
         """Keep them in a new folder. Raises OutputError."""
         self.folder = folder
-        try:
+        with _keeping(folder):
             folder.mkdir()
             (folder / LIST).write_text("# timestamp_s filename\n", encoding="utf-8")
-        except OSError as e:
-            raise OutputError(f"{folder}: expected to keep frames there, got {e.strerror or e}") from e
 
-    def keep(self, frame: Frame) -> None:
-        """Write one frame. Raises OutputError."""
-        name = f"{frame.timestamp_s:.6f}.png"
-        try:
-            done, data = cv2.imencode(".png", np.ascontiguousarray(frame.as_taken.image[..., ::-1]))
-            if not done:
-                raise OSError("an image that PNG cannot hold")
-            (self.folder / name).write_bytes(data.tobytes())
-            with open(self.folder / LIST, "a", encoding="utf-8") as file:
-                file.write(f"{frame.timestamp_s:.6f} {name}\n")
-        except OSError as e:
-            raise OutputError(f"{self.folder}: expected to keep frame {frame.index}, got {e.strerror or e}") from e
+    def keep(self, frame: CameraFrame) -> None:
+        """Have one frame written. Raises OutputError where an earlier one could not be."""
+        self._late.append(self._worker.submit(lambda: self._write(frame)))
+        while len(self._late) > HELD:
+            self._late.popleft().get()
+
+    def settle(self) -> None:
+        """Wait for all of them. Raises OutputError."""
+        self._worker.close()
+        while self._late:
+            self._late.popleft().get()
 
     def frames(self) -> Iterator[Frame]:
         """All frames that were kept. Raises InputError where there are none."""
+        assert self.folder is not None
         yield from open_source(self.folder, SourceConfig(), want_semantic=False).frames()
+
+    def _write(self, frame: CameraFrame) -> None:
+        assert self.folder is not None
+        name = f"{frame.timestamp_s:.6f}.png"
+        _, data = cv2.imencode(".png", np.ascontiguousarray(frame.image[..., ::-1]))
+        with _keeping(self.folder):
+            (self.folder / name).write_bytes(data.tobytes())
+            with open(self.folder / LIST, "a", encoding="utf-8") as file:
+                file.write(f"{frame.timestamp_s:.6f} {name}\n")
+
+
+@contextmanager
+def _keeping(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        raise OutputError(f"{folder}: expected to keep frames there, got {e.strerror or e}") from e

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,7 @@ FORMATS = {"bgr24": 3, "rgb24": 3, "gray8": 1}  # bytes a pixel
 Y4M, LONGEST_HEAD = b"YUV4MPEG2 ", 512
 PLANAR = ("420", "420jpeg", "420mpeg2", "420paldv", "mono")
 LARGEST_SIDE_PX = 16384
+Pipe = BinaryIO | io.RawIOBase
 
 
 class RawFrames:
@@ -31,7 +33,7 @@ class RawFrames:
 
     def __init__(
         self,
-        pipe: BinaryIO,
+        pipe: Pipe,
         size: tuple[int, int],
         frame_bytes: int,
         picture: Callable[[Array], Array],
@@ -55,7 +57,7 @@ class RawFrames:
         while True:
             if self._marked and not self._mark(n):
                 return
-            data = self._pipe.read(self._bytes)
+            data = _exactly(self._pipe, self._bytes)
             if len(data) < self._bytes:
                 if data:
                     self.said.append(f"the pipe ended within frame {n}: {len(data)} of {self._bytes} bytes, left out")
@@ -69,18 +71,19 @@ class RawFrames:
         """Whoever writes sees a closed pipe when this process ends."""
 
     def _mark(self, n: int) -> bool:
-        line = self._pipe.readline(LONGEST_HEAD)
+        line = _line(self._pipe)
         if line and not line.startswith(b"FRAME"):
             raise InputError(f"{self.name}: expected FRAME before frame {n} of a y4m stream, got {line[:16]!r}")
         return bool(line)
 
 
-def standard_input(options: CameraOptions, pipe: BinaryIO | None = None) -> RawFrames:
+def standard_input(options: CameraOptions, pipe: Pipe | None = None) -> RawFrames:
     """Frames of ``--size`` and ``--pixel-format`` on standard input; without a size a y4m stream.
 
     Raises ConfigError for a size or format that is none, InputError for a stream that is no y4m.
     """
-    pipe = sys.stdin.buffer if pipe is None else pipe
+    if pipe is None:  # without Python's buffer, whose lock a thread that waits would hold when the process ends
+        pipe = io.FileIO(sys.stdin.fileno(), closefd=False)
     if options.size is None:
         if options.pixel_format or options.fps:
             raise ConfigError("-: expected --size WxH of raw frames with --pixel-format or --fps, got none")
@@ -101,8 +104,8 @@ def standard_input(options: CameraOptions, pipe: BinaryIO | None = None) -> RawF
     return RawFrames(pipe, options.size, width * height * FORMATS[kind], picture, options, fps=options.fps)
 
 
-def _y4m(pipe: BinaryIO, options: CameraOptions) -> RawFrames:
-    head = pipe.readline(LONGEST_HEAD)
+def _y4m(pipe: Pipe, options: CameraOptions) -> RawFrames:
+    head = _line(pipe)
     if not head.startswith(Y4M):
         got = f"a stream beginning {head[:16]!r}" if head else "an empty one"
         raise InputError(f"-: expected raw frames with --size WxH, or a y4m stream, got {got}")
@@ -124,3 +127,25 @@ def _y4m(pipe: BinaryIO, options: CameraOptions) -> RawFrames:
         return np.asarray(cv2.cvtColor(data.reshape(rows, width), code))
 
     return RawFrames(pipe, (width, height), rows * width, picture, options, fps=fps, marked=True)
+
+
+def _exactly(pipe: Pipe, count: int) -> bytearray:
+    """So many bytes; fewer where the pipe ends."""
+    data = bytearray()
+    while len(data) < count:
+        more = pipe.read(count - len(data))
+        if not more:
+            break
+        data += more
+    return data
+
+
+def _line(pipe: Pipe) -> bytes:
+    """Up to the next end of line, which is included, or ``LONGEST_HEAD`` bytes."""
+    line = bytearray()
+    while len(line) < LONGEST_HEAD and not line.endswith(b"\n"):
+        byte = pipe.read(1)
+        if not byte:
+            break
+        line += byte
+    return bytes(line)

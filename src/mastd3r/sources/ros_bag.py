@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ class RosBag:
         first = next(self._images(), None)
         if first is None:
             raise InputError(f"{path}: expected images on {self._topic}, got none")
-        height, width = first[1]().shape[:2]
+        height, width = first[1].shape[:2]
         self.size = (width, height)
 
     def frames(self) -> Iterator[CameraFrame]:
@@ -91,8 +90,8 @@ class RosBag:
 
         return _Opened(self._path, lambda: AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
 
-    def _images(self) -> Iterator[tuple[float, Callable[[], Array]]]:
-        """(seconds since the first image, what decodes it); messages that do not rise in time are passed over."""
+    def _images(self) -> Iterator[tuple[float, Array]]:
+        """(seconds since the first image, the image); messages that do not rise in time are passed over."""
         with self._reader() as reader:
             wanted = [c for c in reader.connections if c.topic == self._topic]
             first_ns, last_ns = None, -1
@@ -104,7 +103,7 @@ class RosBag:
                 if ns - first_ns <= last_ns:
                     continue
                 last_ns = ns - first_ns
-                yield last_ns * 1e-9, lambda m=message, c=connection: _picture(m, c.msgtype, self._path)
+                yield last_ns * 1e-9, _picture(message, connection.msgtype, self._path)
 
 
 class _Opened:

@@ -16,7 +16,7 @@ from .camera import CameraOptions
 from .lost import Connection, Lost, Reconnecting
 
 Array = NDArray[Any]
-OPEN = {"fflags": "nobuffer", "flags": "low_delay", "probesize": "500000", "analyzeduration": "1000000"}
+OPEN = {"flags": "low_delay", "probesize": "500000", "analyzeduration": "1000000"}
 RTSP = {"rtsp_transport": "tcp"}  # UDP loses packets, which smears pictures
 TRIES = 100  # packets without a picture before a stream is none
 
