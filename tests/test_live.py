@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +24,7 @@ from mastd3r.errors import InputError, OutputError
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.trajectory_files import read_tum
 from mastd3r.live import CameraOptions, LiveFrame, LiveLoop, open_camera, run_live
+from mastd3r.live.warm import warm_up
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.sources.camera import CameraFrame
@@ -28,12 +32,21 @@ from mastd3r.types import StaticCloud, Trajectory
 
 Array = NDArray[Any]
 NO_MAP = with_override(mastd3r.Config(), "mapping.enabled=false")
+SHORT = with_override(NO_MAP, "tracking.first_motion_ratio=0.01")  # for clips that hardly move
 EARLY = with_override(NO_MAP, "graph.bootstrap_keyframes=3")  # so that a short clip has frames after its start
 
 
 def record_of(out: Path) -> dict[str, Any]:
     record: dict[str, Any] = json.loads((out / "run.json").read_text())
     return record
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cold() -> Iterator[None]:
+    """Loops of these tests do not warm up; one test does."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mastd3r.live.loop.warm_up", lambda *_: True)
+        yield
 
 
 class Patient:
@@ -79,32 +92,36 @@ class View:
         self.clouds.append((cloud, path))
 
 
-@pytest.fixture(scope="module")
-def recorded(room_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, View]:
-    """The clip, live, every frame of it, kept; by the library."""
-    out, view = tmp_path_factory.mktemp("live") / "run", View()
-    camera = Patient(room_clip)
+def live_run(camera: Patient, out: Path, config: mastd3r.Config, **how: Any) -> mastd3r.Reconstruction:
+    """``run_live`` of a camera that waits for it."""
+    init = LiveLoop.__init__
+
+    def with_camera(self: LiveLoop, *args: Any, **kwargs: Any) -> None:
+        init(self, *args, **kwargs)
+        camera.loop = self
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mastd3r.live.run.open_camera", lambda *_: camera)
         patch.setattr("mastd3r.live.run.CLOUD_EVERY_S", 0.0)
-        init = LiveLoop.__init__
-
-        def with_camera(self: LiveLoop, *args: Any, **kwargs: Any) -> None:
-            init(self, *args, **kwargs)
-            camera.loop = self
-
         patch.setattr(LiveLoop, "__init__", with_camera)
-        run_live("clip", out, EARLY, record=True, view=view)
+        return run_live("clip", out, config, **how)
+
+
+@pytest.fixture(scope="module")
+def watched(room_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, View]:
+    """The clip, live, every frame of it; by the library."""
+    out, view = tmp_path_factory.mktemp("live") / "run", View()
+    live_run(Patient(room_clip), out, EARLY, view=view)
     return out, view
 
 
-def test_a_live_run_is_a_whole_run(recorded: tuple[Path, View], room_clip: Path) -> None:
-    out, view = recorded
+def test_a_live_run_is_a_whole_run(watched: tuple[Path, View], room_clip: Path) -> None:
+    out, view = watched
     rec, record = mastd3r.load(out), record_of(out)
     assert rec.is_complete and len(rec.poses) == 24 and len(rec.masks) == 24 and len(rec.cloud.points_world) > 50
     assert (out / "report.html").is_file() and (out / "tracks.npz").is_file() and not (out / ".reserve").exists()
     live, metrics = record["live"], rec.metrics
-    assert live["ended"] == "the camera ended" and live["recorded"] and live["camera"] == "clip"
+    assert live["ended"] == "the camera ended" and not live["recorded"] and live["camera"] == "clip"
     assert (metrics["frames_came"], metrics["frames_dropped"], metrics["frames"]) == (24, 0, 24)
     assert 0 < metrics["pose_latency_ms_median"] <= metrics["latency_ms_median"] <= metrics["latency_ms_95"]
     rows = (out / "live_frames.csv").read_text().splitlines()
@@ -127,29 +144,26 @@ def poses(rec: mastd3r.Reconstruction) -> Trajectory:
 
 
 def test_what_was_kept_is_finished_as_a_run_over_it(
-    recorded: tuple[Path, View], room_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    room_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    out = mastd3r.load(recorded[0]).save(tmp_path / "run")
+    out, camera = tmp_path / "run", Patient(room_clip, 8)
+    live_run(camera, out, SHORT, record=True)
     kept = list(open_source(out / "recorded", SourceConfig()).frames())
-    clip = list(open_source(room_clip, SourceConfig()).frames())
-    for a, b in zip(kept, clip, strict=True):
+    for a, b in zip(kept, camera.clip, strict=True):
         assert a.timestamp_s == b.timestamp_s and np.array_equal(a.image, b.image)
-    with pytest.raises(OutputError, match=r"without frames of a live run, got 24 .*--overwrite"):
-        mastd3r.reconstruct(room_clip, out, NO_MAP)
+    with pytest.raises(OutputError, match=r"without frames of a live run, got 8 .*--overwrite"):
+        mastd3r.reconstruct(room_clip, out, SHORT)
     live = (out / "trajectory_live.txt").read_bytes()
     assert main(["finish", str(out), "--quiet"]) == 0
-    whole = mastd3r.reconstruct(out / "recorded", tmp_path / "whole", EARLY)
+    whole = mastd3r.reconstruct(out / "recorded", tmp_path / "whole", SHORT)
     for name in ("trajectory.txt", "keyframes.txt", "cloud.ply"):
         assert (out / name).read_bytes() == (whole.path / name).read_bytes()
     metrics = mastd3r.load(out).metrics
-    assert metrics["latency_ms_median"] > 0 and metrics["frames_dropped"] == 0 and metrics["frames_posed"] == 24
+    assert metrics["latency_ms_median"] > 0 and metrics["frames_dropped"] == 0 and metrics["frames_posed"] == 8
     assert (out / "trajectory_live.txt").read_bytes() == live and (out / "masks.mp4").is_file()
     capfd.readouterr()
-    for words, says in (
-        (["finish", str(out)], "got a finished one"),
-        (["finish", str(whole.path)], "got one of files"),
-    ):
-        assert main([*words, "--quiet"]) == 2
+    for path, says in ((out, "got a finished one"), (whole.path, "got one of files")):
+        assert main(["finish", str(path), "--quiet"]) == 2
         said = capfd.readouterr().err
         assert says in said and said.count("\n") == 1
 
@@ -174,38 +188,66 @@ def test_dropped_frames_are_counted(
     assert "expected a live run that kept its frames (--record)" in capfd.readouterr().err
 
 
-STUCK = (
-    "import sys, time; from mastd3r.slam import Slam; from mastd3r.cli.main import main; track = Slam.track; "
-    "Slam.track = lambda *a, **k: (time.sleep(0.02), track(*a, **k))[1]; sys.exit(main(sys.argv[1:]))"
-)
-
-
-def test_ctrl_c_ends_a_live_run_with_all_of_it(room_clip: Path, tmp_path: Path) -> None:
-    """Frames on standard input; the pipe stays open, and after the last frame nothing comes."""
-    out, images = tmp_path / "run", [f.image for f in open_source(room_clip, SourceConfig()).frames()]
-    words = ["live", "-", "--size", "160x120", "--pixel-format", "rgb24", "--out", str(out), "--record", "--quiet"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", STUCK, *words, "--no-map"],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
-    )
-    assert process.stdin is not None
+def pipe_until_tracked(images: list[Array], write: Callable[[bytes], Any], out: Path) -> None:
+    """Frames into a pipe, the next once the last is in the files of the run; then nothing comes."""
     rows = out / "live_frames.csv"
     for n, image in enumerate(images):
-        process.stdin.write(image.tobytes())
-        process.stdin.flush()
+        write(image.tobytes())
         until = time.monotonic() + 60
         while time.monotonic() < until and not (rows.is_file() and rows.read_text().count("\n") > n + 1):
             time.sleep(0.01)
+
+
+def words_of(out: Path) -> list[str]:
+    size = ["--size", "160x120", "--pixel-format", "rgb24", "--record", "--no-map", "--quiet"]
+    return ["live", "-", *size, "--set", "tracking.first_motion_ratio=0.01", "--out", str(out)]
+
+
+def whole_after_ctrl_c(out: Path, count: int) -> None:
+    record, rec = record_of(out), mastd3r.load(out)
+    assert record["status"] == "complete" and record["live"]["ended"] == "stopped by the user (Ctrl-C)"
+    assert len(rec.poses) == count == len(rec.masks) == len(list((out / "recorded").glob("*.png")))
+    assert len(rec.cloud.points_world) > 20 and rec.metrics["frames_dropped"] == 0
+
+
+def test_ctrl_c_ends_a_live_run_with_all_of_it(
+    room_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Frames on standard input; the pipe stays open, and after the last frame nothing comes."""
+    out, images = tmp_path / "run", [f.image for f in open_source(room_clip, SourceConfig(end=8)).frames()]
+    reading, writing = os.pipe()
+    monkeypatch.setattr(sys, "stdin", os.fdopen(reading, "r"))
+
+    def camera() -> None:
+        pipe_until_tracked(images, lambda data: os.write(writing, data), out)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=camera)
+    thread.start()
+    assert main(words_of(out)) == 0
+    thread.join()
+    os.close(writing)
+    assert capfd.readouterr().err == ""
+    whole_after_ctrl_c(out, 8)
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_process_of_a_live_run(room_clip: Path, tmp_path: Path) -> None:
+    """The thread that waits for the pipe does not hold it, nor break its end."""
+    out, images = tmp_path / "run", [f.image for f in open_source(room_clip, SourceConfig(end=8)).frames()]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mastd3r", *words_of(out)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),  # noqa: PLW1509
+    )
+    assert process.stdin is not None and process.stderr is not None
+    pipe_until_tracked(images, process.stdin.write, out)
     process.send_signal(signal.SIGINT)
     process.wait(60)
-    assert process.stderr is not None and process.stderr.read() == b"" and process.returncode == 0
-    record = record_of(out)
-    assert record["status"] == "complete" and record["live"]["ended"] == "stopped by the user (Ctrl-C)"
-    rec = mastd3r.load(out)
-    assert len(rec.poses) == 24 == len(rec.masks) == len(list((out / "recorded").glob("*.png")))
-    assert len(rec.cloud.points_world) > 50 and rec.metrics["frames_dropped"] == 0
+    assert process.stderr.read() == b"" and process.returncode == 0
+    whole_after_ctrl_c(out, 8)
 
 
 def test_a_second_request_to_stop_is_heeded(room_clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -294,3 +336,8 @@ def test_an_error_of_the_camera_is_the_run_s(room_clip: Path, tmp_path: Path, mo
     with pytest.raises(InputError, match="expected FRAME"):
         run_live("clip", tmp_path / "run", NO_MAP)
     assert record_of(tmp_path / "run")["reason"].startswith("y4m: expected FRAME")
+
+
+def test_warming_up_goes_as_far_as_a_map() -> None:
+    """Every kernel of the loop has been called then."""
+    assert warm_up(NO_MAP, (160, 120))

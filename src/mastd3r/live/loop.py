@@ -22,6 +22,7 @@ from ..sources.passing import KeptSource, PassingSource
 from ..sources.rectified import rectified
 from ..tracking.state import Status
 from ..types import Frame, StaticCloud
+from .warm import warm_up
 
 Array = NDArray[Any]
 LOOK_S = 0.2  # how long a frame is waited for before somebody looks at the clock
@@ -80,10 +81,12 @@ class LiveLoop:
         source: PassingSource | None = None,
         seconds: float | None = None,
         on_frame: Callable[[LiveFrame], None] | None = None,
+        warm: bool = True,
     ) -> None:
         """``source``: what keeps the frames; by default they pass. ``seconds``: it ends so long after its first frame.
 
         ``on_frame`` is called with every frame before it is given, and is not divided from its tracking by a signal.
+        ``warm``: before the camera is read, all kernels are made ready (live/warm.py), which takes seconds.
         Raises ConfigError and InputError for options that a camera cannot serve.
         """
         source = PassingSource(camera) if source is None else source
@@ -91,6 +94,8 @@ class LiveLoop:
         config, self.notes = with_dataset_lens(config, source)
         self.camera, self.source, self._seconds, self.on_frame = camera, source, seconds, on_frame
         self.while_silent: Callable[[], None] = lambda: None  # called now and then while no frame comes
+        if warm:
+            warm_up(config, source.size)
         self.slam = Slam(config, source.size, source=source, live=True)
         self.said: list[str] = []  # what happened, a line each
         self.ended: str | None = None  # why, once it has

@@ -67,7 +67,12 @@ def run_live(
     config = check_config(config or Config())
     opened = open_camera(camera, options or CameraOptions(), config.source)
     source = KeptSource(opened) if record else PassingSource(opened)
-    with LiveLoop(opened, config, source=source, seconds=seconds) as loop:
+    reporter = reporter or Silent()
+    with reporter.stage("warming up", 1, "loop") as bar:
+        bar.say("kernels are compiled by their first use, and loaded by later ones")
+        loop = LiveLoop(opened, config, source=source, seconds=seconds)
+        bar.advance()
+    with loop:
         path = Path(camera).expanduser()
         read = [path] if path.exists() and not path.is_char_device() else []
         with RunFolder(Path(out).expanduser(), list(command), read, overwrite=overwrite) as folder:
@@ -75,7 +80,7 @@ def run_live(
             folder.update(source={"path": where, "maps": None}, live={"recorded": record})
             if isinstance(source, KeptSource):
                 source.begin(folder.path / RECORDED)
-            with LiveJob(loop, folder, reporter or Silent()) as job:
+            with LiveJob(loop, folder, reporter) as job:
                 _watch(loop, job, view)
                 job.end()
     return Reconstruction(folder.path)

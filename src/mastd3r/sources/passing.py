@@ -20,17 +20,17 @@ from .open import open_source
 LIST, HELD = "rgb.txt", 30  # frames that may wait to be written
 
 
-class PassingSource:
-    """What a camera tells of itself, and no frame again: who needs them twice keeps them (``KeptSource``)."""
+class MadeSource:
+    """Frames of a size that nobody reads twice."""
 
-    kind = "live"
+    name = kind = "live"
     has_depth = has_semantic = False
+    calibration: tuple[float, ...] = ()
 
-    def __init__(self, camera: Camera) -> None:
-        self.name, self.size, self.calibration = camera.name, camera.size, camera.calibration
+    def __init__(self, size: tuple[int, int]) -> None:
+        """``size`` (width, height)."""
+        self.size, self.notes = size, list[str]()
         self.length: int | None = None
-        self.focal_hint_px, self.focal_source = camera.focal_hint_px, "what the camera says"
-        self.notes = camera.notes
 
     def frames(self) -> Iterator[Frame]:
         """None: they have passed."""
@@ -39,6 +39,15 @@ class PassingSource:
     def truth(self) -> Truth | None:
         """A camera knows nothing about itself."""
         return None
+
+
+class PassingSource(MadeSource):
+    """What a camera tells of itself, and no frame again: who needs them twice keeps them (``KeptSource``)."""
+
+    def __init__(self, camera: Camera) -> None:
+        super().__init__(camera.size)
+        self.name, self.calibration, self.notes = camera.name, camera.calibration, camera.notes
+        self.focal_hint_px, self.focal_source = camera.focal_hint_px, "what the camera says"
 
 
 class KeptSource(PassingSource):
