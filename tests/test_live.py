@@ -23,11 +23,13 @@ from mastd3r.config import SourceConfig, with_override
 from mastd3r.errors import InputError, OutputError
 from mastd3r.evaluation.trajectory_error import ate_rmse
 from mastd3r.export.trajectory_files import read_tum
+from mastd3r.graph.keyframe_graph import Keyframe, KeyframeGraph
 from mastd3r.live import CameraOptions, LiveFrame, LiveLoop, open_camera, run_live
 from mastd3r.live.warm import warm_up
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.sources.camera import CameraFrame
+from mastd3r.tracking.live_keyframes import LiveKeyframes
 from mastd3r.types import StaticCloud, Trajectory
 
 Array = NDArray[Any]
@@ -72,8 +74,7 @@ class Patient:
     def close(self) -> None:
         pass
 
-    @staticmethod
-    def _busy(loop: LiveLoop) -> bool:
+    def _busy(self, loop: LiveLoop) -> bool:
         pending = loop.slam.keyframes._pending
         return pending is not None and not pending.ready()
 
@@ -341,3 +342,41 @@ def test_an_error_of_the_camera_is_the_run_s(room_clip: Path, tmp_path: Path, mo
 def test_warming_up_goes_as_far_as_a_map() -> None:
     """Every kernel of the loop has been called then."""
     assert warm_up(NO_MAP, (160, 120))
+
+
+def test_keyframes_that_come_while_the_map_is_started_join_it(room_clip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The start takes as long as some frames do, and every keyframe is wanted meanwhile."""
+    monkeypatch.setattr("mastd3r.tracking.live_keyframes.STILL_MATCHED", 1.0)
+    held, release, placed = threading.Event(), threading.Event(), list[int]()
+    started, place = LiveKeyframes._started, LiveKeyframes._place
+
+    def slow(self: LiveKeyframes, aside: KeyframeGraph, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+        if len(aside.members()) >= 3:
+            held.set()
+            release.wait(60)
+        return started(self, aside, new)
+
+    def counted(self: LiveKeyframes, kf: Keyframe, before: int) -> None:
+        placed.append(kf.id)
+        place(self, kf, before)
+
+    def busy(self: Patient, loop: LiveLoop) -> bool:
+        pending = loop.slam.keyframes._pending
+        return pending is not None and not pending.ready() and (release.is_set() or not held.is_set())
+
+    monkeypatch.setattr(LiveKeyframes, "_started", slow)
+    monkeypatch.setattr(LiveKeyframes, "_place", counted)
+    monkeypatch.setattr(Patient, "_busy", busy)
+    camera, found = Patient(room_clip), list[LiveFrame]()
+    with LiveLoop(camera, EARLY) as live:
+        camera.loop = live
+        for seen in live:
+            found.append(seen)
+            if seen.result.index == 16:
+                release.set()
+        assert placed and live.slam.graph.initialised
+    posed = [f for f in found if f.world_from_cam is not None]
+    times_s, pose = np.array([f.timestamp_s for f in posed]), np.stack([f.world_from_cam for f in posed])
+    truth = open_source(room_clip, SourceConfig()).truth()
+    given = Trajectory(times_s, pose, ("tracked",) * len(posed), np.zeros(len(posed), bool))
+    assert truth is not None and (ate_rmse(given, truth).rmse or 1) < 0.1

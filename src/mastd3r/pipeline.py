@@ -148,14 +148,20 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
 
 def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
     """A stopped run, from its last good checkpoint."""
-    with RunFolder.going_on(stopped, read_json(stopped / "run.json")) as folder:
+    record = read_json(stopped / "run.json")
+    ended_live = bool(record.get("live")) and record.get("status") == "complete"
+    with RunFolder.going_on(stopped, record) as folder:
+        if record.get("live"):
+            folder.update(source={"path": str((folder.home / RECORDED).resolve()), "maps": None})
         job = slam.job(folder, reporter, checkpoints=True)
         job.metrics |= (folder.record.get("live") or {}).get("figures") or {}
         with job:
             memory = None if job.checkpoints is None else job.checkpoints.load()
-            if memory is None:
+            done = None
+            if memory is None and ended_live:
+                folder.note("finished: all frames that were recorded live were tracked once more")
+            elif memory is None:
                 folder.note("resumed, but there is no good checkpoint: from the first frame")
-                done = None
             else:
                 at = f"frame {memory.job.frames}" if memory.stage == "tracking" else f"the end of: {memory.stage}"
                 said = f"resumed from the checkpoint at {at}"

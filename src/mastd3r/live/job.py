@@ -154,6 +154,8 @@ class LiveJob(RunJob):
     ) -> None:
         with undivided():
             self._worker.close()
+            if isinstance(self.source, KeptSource):
+                self.source.close()
             if error is not None and self.folder.record["status"] == "running":
                 self.folder.record["live"] = self.facts()
             super().__exit__(kind, error, trace)

@@ -70,7 +70,7 @@ class LiveLoop:
     """Frames of a camera, tracked as they come; as a context it gives camera and threads back.
 
     ``for seen in live`` gives a ``LiveFrame`` as soon as its pose is there; it ends with the camera, or after ``stop``.
-    ``slam`` goes on: ``live.slam`` has the graph, and can be finished where its source keeps the frames.
+    ``live.slam`` has the graph. All but ``stop`` is for the thread that asks for frames.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class LiveLoop:
             last = time.perf_counter()
             yield seen
         self.said += self.camera.said[len(self.said) :]
-        self.ended = self.ended or "the camera ended"
+        self.ended = self.ended or (self.said[-1] if self.said else "the camera ended")
 
     def stop(self) -> None:
         """No frame more; from any thread."""

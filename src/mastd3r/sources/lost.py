@@ -14,6 +14,7 @@ from .camera import CameraFrame, CameraOptions, microseconds
 
 Array = NDArray[Any]
 RETRY_S = 0.5
+STALE_S = 1.0  # a connection that nobody has read for so long holds old pictures
 
 
 class Connection(Protocol):
@@ -51,6 +52,7 @@ class Reconnecting:
         self._closed = threading.Event()
         self._connection: Connection | None = self.connect()
         self.size = self._connection.size
+        self._opened = time.monotonic()
 
     def connect(self) -> Connection:
         """A new connection. Raises InputError."""
@@ -58,6 +60,7 @@ class Reconnecting:
 
     def frames(self) -> Iterator[CameraFrame]:
         """Frame after frame, over all connections."""
+        self._renew_if_stale()
         first: float | None = None
         last_s = -1.0
         while self._connection is not None:
@@ -93,6 +96,17 @@ class Reconnecting:
     def close(self) -> None:
         """End it at its next frame, or at once where it is looked for."""
         self._closed.set()
+
+    def _renew_if_stale(self) -> None:
+        """Another connection where this one has waited; a device, which gives no second one, has short buffers."""
+        if self._connection is None or time.monotonic() - self._opened < STALE_S:
+            return
+        try:
+            newer = self.connect()
+        except InputError:
+            return
+        self._connection.close()
+        self._connection = newer
 
     def _found_again(self, why: str) -> Connection | None:
         """A new connection, if there is one within the time for it."""

@@ -60,6 +60,7 @@ class KeptSource(PassingSource):
         super().__init__(camera)
         self.folder: Path | None = None
         self._worker, self._late = Worker("recording"), deque[Future[None]]()
+        self._closed = False
 
     def begin(self, folder: Path) -> None:
         """Keep them in a new folder. Raises OutputError."""
@@ -69,16 +70,23 @@ class KeptSource(PassingSource):
             (folder / LIST).write_text("# timestamp_s filename\n", encoding="utf-8")
 
     def keep(self, frame: CameraFrame) -> None:
-        """Have one frame written. Raises OutputError where an earlier one could not be."""
+        """Have one frame written, until ``close``. Raises OutputError where an earlier one could not be."""
+        if self._closed:
+            return
         self._late.append(self._worker.submit(lambda: self._write(frame)))
         while len(self._late) > HELD:
             self._late.popleft().get()
 
     def settle(self) -> None:
-        """Wait for all of them. Raises OutputError."""
-        self._worker.close()
+        """Wait for all of them; no more are kept. Raises OutputError."""
+        self.close()
         while self._late:
             self._late.popleft().get()
+
+    def close(self) -> None:
+        """``settle``, whatever came of them."""
+        self._closed = True
+        self._worker.close()
 
     def frames(self) -> Iterator[Frame]:
         """All frames that were kept. Raises InputError where there are none."""
