@@ -350,11 +350,11 @@ def test_keyframes_that_come_while_the_map_is_started_join_it(room_clip: Path, m
     held, release, placed = threading.Event(), threading.Event(), list[int]()
     started, place = LiveKeyframes._started, LiveKeyframes._place
 
-    def slow(self: LiveKeyframes, aside: KeyframeGraph, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+    def slow(self: LiveKeyframes, aside: KeyframeGraph, *new: Any) -> KeyframeGraph:
         if len(aside.members()) >= 3:
             held.set()
             release.wait(60)
-        return started(self, aside, new)
+        return started(self, aside, *new)
 
     def counted(self: LiveKeyframes, kf: Keyframe, before: int) -> None:
         placed.append(kf.id)

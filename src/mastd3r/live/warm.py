@@ -18,6 +18,7 @@ from ..config import Config
 from ..slam import Slam
 from ..sources.passing import MadeSource
 from ..tracking.state import Status
+from ..tracking.two_view import far_matches
 from ..types import Frame
 
 Array = NDArray[Any]
@@ -45,6 +46,9 @@ def warm_up(config: Config, size: tuple[int, int]) -> bool:
             tracked += result.state is Status.TRACKING
             if tracked > AFTER:
                 break
+        anchor, last = slam.state.anchor, slam.state.last
+        if anchor is not None and last is not None:  # a camera that is nearly lost cannot wait for these to be read
+            far_matches(slam.parts, anchor, last.work, last.moving.get())
     finally:
         slam.masks.close()
         slam.keyframes.close()

@@ -153,7 +153,7 @@ class Keyframes:
         graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
         if not graph.initialised:
             self.edges.flows[before.id, kf.id] = view.pair.flow
-        self.edges.add_one_way(graph, kf.id, before.id, invert_flow(view.pair.flow, self.parts.grid_px))
+        self._match_back(kf.id, before.id, view.pair.flow)
         if graph.initialised:
             self._connect(kf, before.id)
         else:
@@ -163,6 +163,10 @@ class Keyframes:
     def _before_another(self) -> None:
         """What must be done before a keyframe may be added."""
         self.settle()
+
+    def _match_back(self, kf_id: int, before: int, flow: Array) -> None:
+        """The matches of a keyframe in the one before it, from the ``flow`` (h, w, 2) that was found the other way."""
+        self.edges.add_one_way(self.graph, kf_id, before, invert_flow(flow, self.parts.grid_px))
 
     def _start_map(self, kf: Keyframe, before: int) -> None:
         """A keyframe before there is depth: its matches, and the start once there are enough of them."""

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..alignment.reproject import StaticMatches, solve_pose
 from ..concurrency import Future
@@ -17,11 +19,15 @@ from ..config import Config
 from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..parts import Parts
+from ..pointmap.flow_maps import invert_flow
 from .depth_prior import predicted_depth
 from .keyframes import KNOWN_ITERATIONS, SOLVED_AS_A_WHOLE, WHOLE_ITERATIONS, WHOLE_KERNEL_PX, Keyframes
 from .state import TrackingState
 from .two_view import TwoView, TwoViewEstimator
 
+Array = NDArray[Any]
+Back = list[tuple[int, int, Array]]
+UNIT_TOLERANCE = 0.01  # of the graph's unit of length: as long as it is kept to that, nothing is done
 STILL_MATCHED = 0.5  # of the matches that a keyframe had at best: as long as so many are left, it is followed
 
 
@@ -38,6 +44,7 @@ class LiveKeyframes(Keyframes):
         self._starting: list[Keyframe] | None = None  # keyframes of the copy, while the job is a start
         self._edges_before = 0  # edges that the copy was made with
         self._waiting: list[tuple[Keyframe, int]] = []  # not in a copy yet, with the keyframe before
+        self._back: Back = []  # keyframes to be matched with the one before, and the flow
         self._ending = False
 
     # -- the stages of a frame -------------------------------------------------------------------------------
@@ -69,32 +76,36 @@ class LiveKeyframes(Keyframes):
             self.settle()
 
     def _close(self, near: int, anchor: int) -> None:
-        if self._ending or not self.parts.provider.side_by_side:
+        if self._at_once():
             super()._close(near, anchor)
         elif self._pending is None:  # else it is closed another time, or after the last frame
             aside = self._copy()
             self._pending = self._worker.submit(lambda: self._closed(aside, near, anchor))
 
+    def _match_back(self, kf_id: int, before: int, flow: Array) -> None:
+        if self._at_once():
+            super()._match_back(kf_id, before, flow)
+        else:
+            self._back.append((kf_id, before, flow))
+
     def _connect(self, kf: Keyframe, before: int) -> None:
-        graph = self.graph
-        if self._ending or not self.parts.provider.side_by_side or len(graph.started) > 1:
+        if self._at_once():
             super()._connect(kf, before)
             return
-        whole = len(graph.members()) in SOLVED_AS_A_WHOLE
-        graph.solve_depths(kf.id)
-        aside = self._copy()
-        self._pending = self._worker.submit(lambda: self._connected(aside, kf, before, whole))
+        whole = len(self.graph.members()) in SOLVED_AS_A_WHOLE
+        aside, back = self._copy(), self._taken_back()
+        self._pending = self._worker.submit(lambda: self._connected(aside, back, kf, before, whole))
 
     def _start_map(self, kf: Keyframe, before: int) -> None:
-        if self._ending or not self.parts.provider.side_by_side:
+        if self._at_once():
             super()._start_map(kf, before)
             return
         self._waiting.append((kf, before))
         if self._pending is None:
             new, self._waiting = self._waiting, []
             self._starting, self._edges_before = list(self.graph.keyframes), len(self.graph.edges)
-            aside = self._copy()
-            self._pending = self._worker.submit(lambda: self._started(aside, new))
+            aside, back = self._copy(), self._taken_back()
+            self._pending = self._worker.submit(lambda: self._started(aside, back, new))
 
     # -- jobs, in the other thread ---------------------------------------------------------------------------
 
@@ -103,22 +114,29 @@ class LiveKeyframes(Keyframes):
             aside.solve_all(KNOWN_ITERATIONS, WHOLE_KERNEL_PX)
         return aside
 
-    def _connected(self, aside: KeyframeGraph, kf: Keyframe, before: int, whole: bool) -> KeyframeGraph:
+    def _connected(self, aside: KeyframeGraph, back: Back, kf: Keyframe, before: int, whole: bool) -> KeyframeGraph:
+        self._matched_back(aside, back)
         self.edges.connect(aside, kf, before)
         if whole:
             aside.solve_all(WHOLE_ITERATIONS, WHOLE_KERNEL_PX)
         return aside
 
-    def _started(self, aside: KeyframeGraph, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+    def _started(self, aside: KeyframeGraph, back: Back, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+        self._matched_back(aside, back)
         self._matched(aside, new)
         if len(aside.members()) >= self.config.graph.bootstrap_keyframes:
             bootstrap(aside, hurry=True)
         return aside
 
-    def _joined(self, aside: KeyframeGraph, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+    def _joined(self, aside: KeyframeGraph, back: Back, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
+        self._matched_back(aside, back)
         self._matched(aside, new)
         aside.solve_window()
         return aside
+
+    def _matched_back(self, aside: KeyframeGraph, back: Back) -> None:
+        for kf_id, before, flow in back:
+            self.edges.add_one_way(aside, kf_id, before, invert_flow(flow, self.parts.grid_px))
 
     def _matched(self, aside: KeyframeGraph, new: list[tuple[Keyframe, int]]) -> None:
         """Edges of keyframes that came one after the other."""
@@ -128,6 +146,15 @@ class LiveKeyframes(Keyframes):
             self.edges.add_recent(until, kf, before)
 
     # -- copies, and what comes back -------------------------------------------------------------------------
+
+    def _at_once(self) -> bool:
+        """Whether nothing is left to a job: at the end, with a network that serves one, where submaps may be joined."""
+        return self._ending or not self.parts.provider.side_by_side or len(self.graph.started) > 1
+
+    def _taken_back(self) -> Back:
+        """The way back of the keyframes that there are."""
+        back, self._back = [b for b in self._back if b[0] < len(self.graph.keyframes)], []
+        return back
 
     def _copy(self) -> KeyframeGraph:
         """A copy that a job may do with as it likes; the unit of length stays, for frames hang on this one."""
@@ -149,6 +176,9 @@ class LiveKeyframes(Keyframes):
         graph = self.graph
         is_gone = graph.submap != made.submap or any(a is not b for a, b in zip(known, graph.keyframes, strict=False))
         if is_gone or len(graph.keyframes) < len(known):  # the submap was given up meanwhile
+            there = {id(kf) for kf in graph.keyframes}
+            self._waiting = [(kf, before) for kf, before in new if id(kf) in there]
+            self._back = [b for b in self._back if b[0] in {kf.id for kf, _ in self._waiting}]
             return 1.0
         graph.edges = made.edges + graph.edges[self._edges_before :]
         graph.variables.update((kf.id, made.variables[kf.id]) for kf in known)
@@ -162,8 +192,8 @@ class LiveKeyframes(Keyframes):
         self.edges.flows.clear()
         scale = self._unit_again()
         if new:
-            aside = self._copy()
-            self._pending = self._worker.submit(lambda: self._joined(aside, new))
+            aside, back = self._copy(), self._taken_back()
+            self._pending = self._worker.submit(lambda: self._joined(aside, back, new))
         return scale
 
     def _place(self, kf: Keyframe, before: int) -> None:
@@ -188,7 +218,10 @@ class LiveKeyframes(Keyframes):
         graph = self.graph
         if graph.submap != 0 or not graph.initialised:
             return 1.0
-        first = graph.members()[0]
+        first = sorted(graph.variables)[0]
+        unit = float(np.median([graph.median_inv_depth(k) for k in sorted(graph.variables)[:3]]))
+        if abs(unit - 1) < UNIT_TOLERANCE:
+            return 1.0  # it would go through all frames that there are
         before = float(np.median(graph.variables[first].inv_depth))
         graph.normalise()
         return before / float(np.median(graph.variables[first].inv_depth))
