@@ -15,16 +15,22 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .config import Config
     from .errors import ConfigError, InputError, MissingPackage, OutputError, SlamError
+    from .live.loop import LiveFrame, LiveLoop
+    from .live.run import run_live
     from .offline.reconstruction import Reconstruction
-    from .pipeline import evaluate_trajectory, load, reconstruct
+    from .pipeline import evaluate_trajectory, finish_live, load, reconstruct
     from .slam import Slam, TrackResult
+    from .sources.camera import CameraOptions, open_camera
     from .tracking.state import Status
 
 __version__ = "0.1.0"
 __all__ = [
+    "CameraOptions",
     "Config",
     "ConfigError",
     "InputError",
+    "LiveFrame",
+    "LiveLoop",
     "MissingPackage",
     "OutputError",
     "Reconstruction",
@@ -34,13 +40,19 @@ __all__ = [
     "TrackResult",
     "__version__",
     "evaluate_trajectory",
+    "finish_live",
     "load",
+    "open_camera",
     "reconstruct",
+    "run_live",
 ]
 _HOME = {
+    "CameraOptions": "sources.camera",
     "Config": "config",
     "ConfigError": "errors",
     "InputError": "errors",
+    "LiveFrame": "live.loop",
+    "LiveLoop": "live.loop",
     "MissingPackage": "errors",
     "OutputError": "errors",
     "Reconstruction": "offline.reconstruction",
@@ -49,8 +61,11 @@ _HOME = {
     "Status": "tracking.state",
     "TrackResult": "slam",
     "evaluate_trajectory": "pipeline",
+    "finish_live": "pipeline",
     "load": "pipeline",
+    "open_camera": "sources.camera",
     "reconstruct": "pipeline",
+    "run_live": "live.run",
 }
 
 

@@ -21,10 +21,13 @@ C = TypeVar("C")
 
 
 class Future(Generic[T]):
-    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised."""
+    """A value that may still be in the making; ``get`` waits for it, and raises what its making raised.
 
-    def __init__(self, get: Callable[[], T]) -> None:
-        self.get = get
+    ``ready`` says whether it is there; who goes by that has results that depend on the machine's speed.
+    """
+
+    def __init__(self, get: Callable[[], T], ready: Callable[[], bool] = lambda: True) -> None:
+        self.get, self.ready = get, ready
 
     @staticmethod
     def done(value: T) -> Future[T]:
@@ -54,7 +57,8 @@ class Worker:
 
     def submit(self, make: Callable[[], T]) -> Future[T]:
         """The value of ``make``, made there."""
-        return Future(self._pool.submit(make).result)
+        made = self._pool.submit(make)
+        return Future(made.result, made.done)
 
     def close(self) -> None:
         """Wait for all that was given to it, and end it."""
@@ -86,6 +90,67 @@ def prefetch(items: Iterator[T], work: Callable[[T, C], None], context: Callable
         while (item := job.result()) is not end:
             job = pool.submit(one, context())
             yield item  # type: ignore[misc]
+
+
+class Newest(Generic[T]):
+    """A slot of one, filled from an iterator by a thread of its own: whoever takes gets the newest item.
+
+    What is not taken before the next one comes is dropped, and counted: nothing waits in a queue. The thread is not
+    waited for at the end of the process, since who reads a camera may wait for it for ever.
+    """
+
+    def __init__(self, items: Iterator[T], name: str) -> None:
+        self._items, self._change = items, threading.Condition()
+        self._slot: list[T] = []
+        self._over, self._closed = False, False
+        self._error: BaseException | None = None
+        self.came = self.dropped = 0
+        self._thread = threading.Thread(target=self._read, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing comes any more: the iterator has ended, and its last item was taken."""
+        with self._change:
+            return self._over and not self._slot
+
+    def take(self, timeout_s: float) -> T | None:
+        """The newest item; None where none has come in so long, or none comes any more (``over``).
+
+        Raises what the iterator raised, once its last item was taken.
+        """
+        with self._change:
+            self._change.wait_for(lambda: self._slot or self._over, timeout_s)
+            if self._slot:
+                return self._slot.pop()
+            if self._error is not None:
+                error, self._error = self._error, None
+                raise error
+            return None
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Take nothing more: the thread ends at its next item, which is waited for no longer than that."""
+        with self._change:
+            self._closed = True
+            self._slot.clear()
+        self._thread.join(timeout_s)
+
+    def _read(self) -> None:
+        try:
+            for item in self._items:
+                with self._change:
+                    if self._closed:
+                        return
+                    self.came += 1
+                    self.dropped += len(self._slot)
+                    self._slot[:] = [item]
+                    self._change.notify()
+        except BaseException as e:  # noqa: BLE001  whoever takes is told
+            self._error = e
+        finally:
+            with self._change:
+                self._over = True
+                self._change.notify()
 
 
 class _BlasLimit:

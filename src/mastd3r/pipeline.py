@@ -17,7 +17,7 @@ from .concurrency import one_blas_thread
 from .config import Config, check_config, config_from_yaml, config_to_yaml
 from .errors import InputError
 from .evaluation.evaluate import evaluate_trajectory as score
-from .export.claim import CHECKPOINT, stopped_run
+from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
 from .export.read_run import read_json
 from .export.run_folder import RunFolder
 from .export.trajectory_files import read_trajectory
@@ -89,11 +89,39 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
     stopped = stopped_run(path)
     if stopped is None:
         raise InputError(f"{path}: expected a run that was stopped, got {_what_is_in(path)}")
-    read = read_json(stopped / "run.json").get("source") or {}
+    record = read_json(stopped / "run.json")
+    if record.get("live"):
+        raise InputError(f"{stopped}: expected a run of files, got a live one; mastd3r finish goes on with its frames")
+    read = record.get("source") or {}
     if not (stopped / "config.yaml").is_file() or not read.get("path"):
         raise InputError(f"{stopped}: expected config.yaml and source.path in run.json, got a run stopped before them")
     slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"))
     return _go_on(slam, stopped, reporter or Silent())
+
+
+@one_blas_thread()
+def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconstruction:
+    """The rest of a live run that kept its frames, as ``mastd3r finish``: masks both ways, cloud, map, report.
+
+    All frames that came are tracked once more, without hurry: the trajectory is that of ``reconstruct`` over them.
+    Stopped, it goes on where it was. Raises InputError for a folder that holds no such run, or one that is finished;
+    otherwise as ``reconstruct``.
+    """
+    path = Path(run).expanduser()
+    if not (path / "run.json").is_file() and stopped_run(path) is None:
+        raise InputError(f"{path}: expected the folder of a live run, got {_what_is_in(path)}")
+    at = stopped_run(path) or path
+    record = read_json(at / "run.json")
+    if not record.get("live"):
+        raise InputError(f"{at}: expected a live run, got one of files; mastd3r resume goes on with those")
+    if not record["live"].get("recorded") or not (at / RECORDED / RECORDED_LIST).is_file():
+        raise InputError(f"{at}: expected a live run that kept its frames (--record), got one that let them pass")
+    if record.get("status") == "complete" and "masks" in record.get("timings_s", {}):
+        raise InputError(f"{at}: expected a live run that is not finished, got a finished one; mastd3r map goes on")
+    if not (at / "config.yaml").is_file():
+        raise InputError(f"{at}: expected config.yaml beside the frames, got a run stopped before it")
+    slam, _ = _slam_of(at / RECORDED, config_from_yaml(at / "config.yaml"), None)
+    return _go_on(slam, at, reporter or Silent())
 
 
 def _what_is_in(path: Path) -> str:
@@ -120,13 +148,20 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
 
 def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
     """A stopped run, from its last good checkpoint."""
-    with RunFolder.going_on(stopped, read_json(stopped / "run.json")) as folder:
+    record = read_json(stopped / "run.json")
+    ended_live = bool(record.get("live")) and record.get("status") == "complete"
+    with RunFolder.going_on(stopped, record) as folder:
+        if record.get("live"):
+            folder.update(source={"path": str((folder.home / RECORDED).resolve()), "maps": None})
         job = slam.job(folder, reporter, checkpoints=True)
+        job.metrics |= (folder.record.get("live") or {}).get("figures") or {}
         with job:
             memory = None if job.checkpoints is None else job.checkpoints.load()
-            if memory is None:
+            done = None
+            if memory is None and ended_live:
+                folder.note("finished: all frames that were recorded live were tracked once more")
+            elif memory is None:
                 folder.note("resumed, but there is no good checkpoint: from the first frame")
-                done = None
             else:
                 at = f"frame {memory.job.frames}" if memory.stage == "tracking" else f"the end of: {memory.stage}"
                 said = f"resumed from the checkpoint at {at}"

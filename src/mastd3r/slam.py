@@ -33,6 +33,7 @@ from .progress import Reporter, Silent
 from .sources.recorded import RecordedSource
 from .sources.rectified import RectifiedSource, rectified
 from .tracking.keyframes import Keyframes
+from .tracking.live_keyframes import LiveKeyframes
 from .tracking.loop_closure import add_covisible_pairs, close_loops
 from .tracking.lost_frames import find_lost
 from .tracking.masking import MaskTracker
@@ -77,10 +78,12 @@ class Slam:
         *,
         source: Source | None = None,
         parts: Parts | None = None,
+        live: bool = False,
     ) -> None:
         """``size`` (width, height) of the images. ``source``: what the frames come from, if it can be read again.
 
         Without one, frames are kept on disk until ``finish``. ``parts``: instead of those that the options name.
+        ``live``: no frame waits for keyframes or the start of the map; results then depend on the machine's speed.
         Raises ConfigError and InputError for options that this machine or source cannot serve.
         """
         self.config = check_config(config or Config())
@@ -94,7 +97,8 @@ class Slam:
         self.config = with_map_effort(self.config, self.source.size, self.map_device, self.parts.notes)
         self.graph = _empty_graph(self.config, self.parts, self.rectifier, self.seen)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
-        self.keyframes = Keyframes(self.config, self.parts, self.graph, self.two_view)
+        keyframes = LiveKeyframes if live else Keyframes
+        self.keyframes: Keyframes = keyframes(self.config, self.parts, self.graph, self.two_view)
         self.recovery = Recovery(self.parts, self.graph, self.two_view, self.keyframes)
         self.masks = MaskTracker(self.parts.dynamics.filter(*self.parts.provider.size), self.graph)
         self.observer = Observer(self.parts)

@@ -40,7 +40,7 @@ def resume(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r resume``."""
     from ..pipeline import resume as go_on
 
-    _show(go_on(args.run, reporter=_reporter(args, console)))
+    show(go_on(args.run, reporter=reporter_of(args, console)))
     return 0
 
 
@@ -50,14 +50,14 @@ def train_map(args: argparse.Namespace, console: Console) -> int:
 
     minutes = None if args.minutes is None else checked_minutes(args.minutes, "--minutes")
     run = load(args.run)
-    reporter = _reporter(args, console)
+    reporter = reporter_of(args, console)
     metrics = run.train_map(minutes, args.quality, source=args.source, reporter=reporter)
     Console().print(_table(metrics))
     _open(run.path)
     return 0
 
 
-def _reporter(args: argparse.Namespace, console: Console) -> Reporter:
+def reporter_of(args: argparse.Namespace, console: Console) -> Reporter:
     """Bars, unless ``--quiet`` is said; ``demo`` has no such option."""
     from ..progress import Silent
     from .terminal import Terminal
@@ -83,13 +83,13 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
         maps=getattr(args, "maps", None),
         overwrite=args.overwrite,
         command=args.words,
-        reporter=_reporter(args, console),
+        reporter=reporter_of(args, console),
     )
-    _show(result)
+    show(result)
     return 0
 
 
-def _show(result: Reconstruction) -> None:
+def show(result: Reconstruction) -> None:
     """What came of a run."""
     if result.observability.get("said"):
         Console().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
@@ -155,7 +155,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r export``."""
     from ..pipeline import load
 
-    reporter = _reporter(args, console)
+    reporter = reporter_of(args, console)
     options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
     written = load(args.run).export(args.to, args.out, reporter=reporter, **options)
     Console().print(f"wrote {written}", soft_wrap=True, markup=False)

@@ -14,6 +14,7 @@ from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
 from .download import download_parser
+from .live import finish_parser, live_parser
 from .view import view_parser
 from .weights import weights_parser
 
@@ -46,6 +47,8 @@ def parser() -> argparse.ArgumentParser:
     again.add_argument("run", type=Path, help="run folder; source and options are those that it was started with")
     again.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     again.set_defaults(act=commands.resume)
+    live_parser(known.add_parser("live", help="track a camera, stream or recording while it runs"))
+    finish_parser(known.add_parser("finish", help="offline masks, cloud and map of a live run that kept its frames"))
     _map_parser(known.add_parser("map", help="go on with the map of a run that has ended"))
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
     demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")

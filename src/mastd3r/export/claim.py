@@ -20,9 +20,10 @@ from .run_log import is_held
 FILES = (
     "config.yaml", "trajectory.txt", "keyframes.txt", "states.txt", "camera.json", "cloud.ply", "cloud_dense.ply",
     "gaussians.ply", "gaussians.spz", "flight.mp4", "metrics.json", "report.html", "aligned.txt", "masks.mp4",
-    "tracks.npz", "run.log",
+    "tracks.npz", "run.log", "trajectory_live.txt", "live_frames.csv",
 )  # fmt: skip
 FOLDERS = ("masks", "renders", "alpha", "depth")
+RECORDED, RECORDED_LIST = "recorded", "rgb.txt"  # frames of a live run, which nobody can take again
 RECORD_FILE, RESERVE = "run.json", ".reserve"
 CHECKPOINT = "checkpoint"  # folder of a run that goes on, or was stopped
 UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
@@ -40,7 +41,8 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
     is nothing worth keeping, what is left of an earlier run is removed and the folder itself is written in.
     ``inputs`` are what the run will read (the source, the user's maps). Raises OutputError, before anything is
     touched, for a folder that holds one of them or lies in one, that has files of unknown origin and no run of ours,
-    or whose names of ours are symbolic links; and for whatever the system refuses.
+    or whose names of ours are symbolic links; for one with frames of a live run, unless ``overwrite``; and for
+    whatever the system refuses.
     """
     with writing(folder):
         refuse_inputs(folder, inputs)
@@ -56,6 +58,8 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
             )
         check_not_in_use(folder)
         settle(folder)
+        if not overwrite:
+            _refuse_recorded(folder)
         _remove_run(unfinished)
         if (folder / "trajectory.txt").is_file() and not overwrite:
             folder = unfinished
@@ -80,7 +84,8 @@ def settle(folder: Path, *, also_incomplete: bool = False) -> None:
                 if not (new / old.relative_to(folder)).is_file():
                     old.unlink()
             (new / MOVING).touch()
-        for name in FOLDERS:
+        remove_checkpoints(folder / CHECKPOINT)
+        for name in (*FOLDERS, *([RECORDED] if (new / RECORDED).is_dir() else [])):
             (folder / name).mkdir(exist_ok=True)
         for file in _files_of(new):
             os.replace(file, folder / file.relative_to(new))
@@ -90,8 +95,9 @@ def settle(folder: Path, *, also_incomplete: bool = False) -> None:
 
 def _files_of(folder: Path) -> list[Path]:
     """Of the run in a folder, all but run.json."""
-    pictures = [p for name in FOLDERS for p in _pictures(folder / name)]
-    return [path for name in FILES if (path := folder / name).is_file()] + pictures
+    pictures = [p for name in (*FOLDERS, RECORDED) for p in _pictures(folder / name)]
+    files = (*FILES, f"{RECORDED}/{RECORDED_LIST}")
+    return [path for name in files if (path := folder / name).is_file()] + pictures
 
 
 def _remove_run(folder: Path) -> None:
@@ -101,7 +107,7 @@ def _remove_run(folder: Path) -> None:
     remove_checkpoints(folder / CHECKPOINT)
     for name in (RECORD_FILE, RESERVE, MOVING, *(f"{name}.part" for name in (*FILES, RECORD_FILE, RESERVE))):
         (folder / name).unlink(missing_ok=True)
-    for path in (*(folder / name for name in FOLDERS), folder):
+    for path in (*(folder / name for name in (*FOLDERS, RECORDED)), folder):
         with suppress(OSError):
             path.rmdir()
 
@@ -145,8 +151,17 @@ def refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
             raise OutputError(f"{folder}: expected a folder outside what is read, got one inside {given}; {ANOTHER}")
 
 
+def _refuse_recorded(folder: Path) -> None:
+    for path in (folder / RECORDED, folder / UNFINISHED / RECORDED):
+        if frames := len(_pictures(path)):
+            raise OutputError(
+                f"{folder}: expected a folder without frames of a live run, got {frames} in {path}; {ANOTHER}, or "
+                "--overwrite to remove them"
+            )
+
+
 def _refuse_links(folder: Path) -> None:
-    for name in (*FILES, *FOLDERS, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT):
+    for name in (*FILES, *FOLDERS, RECORDED, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: expected a file or folder of a run, got a symbolic link; {ANOTHER}")
 

@@ -44,7 +44,7 @@ class _Start:
     state: dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of each keyframe
 
 
-def bootstrap(whole: KeyframeGraph) -> bool:
+def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
     """Solve all keyframes of the submap being tracked. False where no start was found (too little parallax).
 
     As long as there is no map at all, keyframes between which the camera stands still, or only turns, are not tried:
@@ -52,7 +52,8 @@ def bootstrap(whole: KeyframeGraph) -> bool:
 
     Several first pairs and focal lengths are tried, each to the end; the start that explains the most matches is
     kept, and matches that it leaves out lose their weight: nothing else tells yet what moves. World is the submap's
-    first keyframe's camera. Intrinsics that an earlier submap has found stay as they are.
+    first keyframe's camera. Intrinsics that an earlier submap has found stay as they are. In a ``hurry`` no more are
+    tried once two focal lengths have come to the same end.
     """
     graph = whole.part()
     turns: set[tuple[int, int]] = set()
@@ -64,7 +65,7 @@ def bootstrap(whole: KeyframeGraph) -> bool:
             log.info("no start: the image motion is that of a camera %s", WITHOUT_PARALLAX[seen.kind])
             return False
         turns = {(p.ref, p.new) for p in pairs if explained_by_turn(p, seen.noise_px, graph.size)}
-    best = min(_starts(graph, turns), key=lambda start: start.cost, default=None)
+    best = min(_starts(graph, turns, hurry), key=lambda start: start.cost, default=None)
     if best is None:
         return False
     graph.set_intrinsics(best.intrinsics)
@@ -93,7 +94,7 @@ def bootstrap(whole: KeyframeGraph) -> bool:
     return True
 
 
-def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> Iterator[_Start]:
+def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]], hurry: bool) -> Iterator[_Start]:
     """Every start that comes to an end, those that come to the same one once; not from pairs that are ``turns``."""
     known = graph.intrinsics
     focals = first_focals(graph)
@@ -111,6 +112,8 @@ def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> Iterator[_Star
             log_focal = float(graph.intrinsics.values[0])
             if any(abs(log_focal - f) < SAME and abs(cost - c) < SAME * c for f, c in ends):
                 same += 1
+                if hurry:
+                    return
                 continue
             ends.append((log_focal, cost))
             left_out = _settle_on_most(graph)

@@ -30,6 +30,7 @@ Array = NDArray[Any]
 EDGES_AFTER = 4  # frames after a keyframe until its edges are taken: at the same frame however fast they were made
 SOLVED_AS_A_WHOLE = (10, 16, 24, 40, 64, 100, 160, 256)  # keyframes at which all of them move, not the window alone
 WHOLE_ITERATIONS, WHOLE_KERNEL_PX = 6, 1.0  # of that solve
+KNOWN_ITERATIONS = 4  # of the one where a known place closes a detour
 DEPTH_KNOWN = 0.1  # share of a first keyframe's points with a measured depth, above: it needs no parallax
 KNOWN_PLACE_MATCHED = 0.4  # share of an older keyframe's points matched, above: it is followed instead of a new one
 THIN_MOTION = 0.4  # of a keyframe's motion: where matches are thin that is enough
@@ -107,10 +108,14 @@ class Keyframes:
         if not self.two_view.accepted(view) or not nearby or matched_share(kf, view.weight) < KNOWN_PLACE_MATCHED:
             return None
         if abs(near - anchor.id) > 1 and not graph.connected(near, anchor.id):
-            self.settle()
-            if self.edges.add(graph, near, anchor.id):
-                graph.solve_all(4, 1.0)
+            self._close(near, anchor.id)
         return _following(state, view, view.matched)
+
+    def _close(self, near: int, anchor: int) -> None:
+        """Two keyframes see the same after a detour: they are matched, and everything moves."""
+        self.settle()
+        if self.edges.add(self.graph, near, anchor):
+            self.graph.solve_all(KNOWN_ITERATIONS, WHOLE_KERNEL_PX)
 
     # -- making them -----------------------------------------------------------------------------------------
 
@@ -138,7 +143,7 @@ class Keyframes:
 
     def _add(self, state: TrackingState, view: TwoView) -> TrackingState:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
-        self.settle()
+        self._before_another()
         graph, before, last = self.graph, state.anchor, state.last
         assert before is not None and last is not None
         work, mask = last.work, last.moving.get()
@@ -150,14 +155,27 @@ class Keyframes:
         graph.connect(before.id, kf.id, view.pair.matches, static_at(mask, view.pair.matches.new_px), followed=True)
         if not graph.initialised:
             self.edges.flows[before.id, kf.id] = view.pair.flow
-        self.edges.add_one_way(graph, kf.id, before.id, invert_flow(view.pair.flow))
+        self._match_back(kf.id, before.id, view.pair.flow)
         if graph.initialised:
             self._connect(kf, before.id)
         else:
-            self.edges.add_recent(graph, kf, before.id)
-            if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
-                self.edges.flows.clear()
+            self._start_map(kf, before.id)
         return replace(_at_keyframe(state, kf), status=status_in(graph))
+
+    def _before_another(self) -> None:
+        """What must be done before a keyframe may be added."""
+        self.settle()
+
+    def _match_back(self, kf_id: int, before: int, flow: Array) -> None:
+        """The matches of a keyframe in the one before it, from the ``flow`` (h, w, 2) that was found the other way."""
+        self.edges.add_one_way(self.graph, kf_id, before, invert_flow(flow))
+
+    def _start_map(self, kf: Keyframe, before: int) -> None:
+        """A keyframe before there is depth: its matches, and the start once there are enough of them."""
+        graph = self.graph
+        self.edges.add_recent(graph, kf, before)
+        if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
+            self.edges.flows.clear()
 
     def _connect(self, kf: Keyframe, before: int) -> None:
         """Connect a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
