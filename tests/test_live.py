@@ -89,7 +89,8 @@ class View:
     def frame(self, seen: LiveFrame) -> None:
         self.frames.append(seen)
 
-    def cloud(self, cloud: StaticCloud, path: Array) -> None:
+    def cloud(self, cloud: StaticCloud, times_s: Array, path: Array) -> None:
+        assert len(times_s) == len(path) and (np.diff(times_s) > 0).all()
         self.clouds.append((cloud, path))
 
 
@@ -292,7 +293,7 @@ def test_a_loop_ends_when_it_is_told_to_and_when_nothing_comes(room_clip: Path) 
     with LiveLoop(camera, NO_MAP) as live:
         first = next(iter(live))
         assert first.timestamp_s == 0.0 and first.state == "initialising" and first.world_from_cam is None
-        assert not len(live.cloud().points_world) and live.path().shape == (0, 4, 4)
+        assert not len(live.cloud().points_world) and live.path()[1].shape == (0, 4, 4)
     assert live.ended == "it was stopped"
     silent = Patient(room_clip, 1)
     silent.timeout_s = 0.0

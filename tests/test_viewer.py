@@ -10,6 +10,7 @@ import urllib.request
 import webbrowser
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from mastd3r.export.mesh_files import read_mesh, write_mesh
 from mastd3r.export.read_run import read_run
 from mastd3r.export.video import write_video
 from mastd3r.geometry.se3 import so3_exp
+from mastd3r.live.browser import BrowserView
 from mastd3r.mapping.gaussian_arrays import GaussianArrays
 from mastd3r.mapping.ply import write_gaussians_ply
 from mastd3r.sources import open_source
@@ -75,6 +77,51 @@ def at(x: float) -> Array:
     pose = np.eye(4)
     pose[0, 3] = x
     return pose
+
+
+class Shown:
+    """A scene that notes what it is given."""
+
+    def __init__(self) -> None:
+        self.frames: list[tuple[float, bool, State]] = []
+        self.clouds, self.pictures, self.selected = 0, 0, -1
+
+    @property
+    def count(self) -> int:
+        return len(self.frames)
+
+    def add_frames(self, times_s: Any, poses: Any, states: Any) -> None:
+        self.frames += [(t, p is not None, s) for t, p, s in zip(times_s, poses, states, strict=True)]
+
+    def replace_frames(self, times_s: Any, poses: Any, states: Any) -> None:
+        self.frames = []
+        self.add_frames(times_s, poses, states)
+
+    def set_cloud(self, layer: str, points_world: Array, colors: Array) -> None:
+        assert layer == "sparse" and len(points_world) == len(colors) == 4
+        self.clouds += 1
+
+    def set_image(self, image: Array, mask: Array, text: str) -> None:
+        assert mask.dtype == np.uint8 and mask.max() == 255
+        self.pictures += 1
+
+    def select(self, index: int) -> None:
+        self.selected = index
+
+
+def test_a_live_run_is_shown_whole_however_slow_the_browser_is() -> None:
+    scene = Shown()
+    view = BrowserView(scene)  # type: ignore[arg-type]
+    for n in range(30):
+        pose = None if n == 3 else at(0.1 * n)
+        view.frame(SimpleNamespace(timestamp_s=n / 10, world_from_cam=pose, moving=np.eye(6), image=None, state="x"))  # type: ignore[arg-type]
+        if n == 19:
+            cloud = SimpleNamespace(points_world=np.zeros((4, 3)), colors=np.zeros((4, 3), np.uint8))
+            view.cloud(cloud, np.arange(20) / 10, np.stack([at(0.2 * k) for k in range(20)]))  # type: ignore[arg-type]
+    view.close()
+    assert [t for t, _, _ in scene.frames] == [n / 10 for n in range(30)]
+    assert scene.clouds == 1 and scene.pictures >= 1 and scene.selected == 29
+    assert {s for _, _, s in scene.frames} == {"tracked"}  # the lost one has no place in the path of the map
 
 
 def test_the_path_has_the_colours_of_its_states() -> None:

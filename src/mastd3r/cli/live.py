@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 from rich.console import Console
 
@@ -13,6 +15,10 @@ from ..config import PRESETS, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..registry import ALIGNMENT
 from .options import config_from_args
+from .view import told_at
+
+if TYPE_CHECKING:
+    from ..live.browser import BrowserView
 
 CAMERA_HELP = (
     "0 (a camera of this machine) or its device; a URL (rtsp, http, udp, ...); - for raw frames or y4m on standard "
@@ -47,6 +53,8 @@ def live_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--kind", choices=get_args(SourceKind), help="of a folder that is played")
     for name in ("start", "end", "stride"):
         p.add_argument(f"--{name}", type=int, help="of frames that are played, as for run")
+    p.add_argument("--view", action="store_true", help="show it in the browser while it runs (extra [view])")
+    p.add_argument("--no-browser", action="store_true", help="with --view: say the address, open nothing")
     p.add_argument("--quiet", action="store_true", help="no progress, no warnings")
     p.set_defaults(act=live, realtime=False, **dict.fromkeys(NOT_LIVE))
 
@@ -73,21 +81,45 @@ def live(args: argparse.Namespace, console: Console) -> int:
         pace_fps=seconds["pace"],
         **{k: v for k, v in given.items() if v is not None},
     )
-    result = run_live(
-        args.camera,
-        args.out,
-        config_from_args(args),
-        options=options,
-        record=args.record,
-        seconds=seconds["seconds"],
-        overwrite=args.overwrite,
-        command=args.words,
-        reporter=reporter_of(args, console),
-    )
+    config = config_from_args(args)
+    with _in_browser(args, console) as view:
+        result = run_live(
+            args.camera,
+            args.out,
+            config,
+            options=options,
+            record=args.record,
+            seconds=seconds["seconds"],
+            overwrite=args.overwrite,
+            command=args.words,
+            reporter=reporter_of(args, console),
+            view=view,
+        )
     show(result)
     if args.record:
         Console().print(f"mastd3r finish {args.out} makes the rest", soft_wrap=True, markup=False)
     return 0
+
+
+@contextmanager
+def _in_browser(args: argparse.Namespace, console: Console) -> Iterator[BrowserView | None]:
+    """What shows the run while it runs, where that was asked for."""
+    if not args.view:
+        yield None
+        return
+    from ..live.browser import BrowserView
+    from ..viewer.scene import Scene
+    from ..viewer.server import address, open_server
+
+    server = open_server(f"live {args.camera}")
+    told_at(address(server), args, console)
+    scene = Scene(server)
+    view = BrowserView(scene)
+    try:
+        yield view
+    finally:
+        view.close()
+        scene.close()
 
 
 def finish(args: argparse.Namespace, console: Console) -> int:

@@ -36,11 +36,16 @@ def view(args: argparse.Namespace, console: Console) -> int:
     with show_run(args.run, args.host, args.port, args.file) as viewer:
         for line in viewer.notices:
             console.print(line, soft_wrap=True, markup=False)
-        Console().print(f"{viewer.address}  (Ctrl-C ends it)", soft_wrap=True, markup=False, highlight=False)
-        if not args.no_browser and not _browse(viewer.address):
-            console.print("no browser found: open that address in one", markup=False)
+        told_at(viewer.address, args, console)
         while True:
             time.sleep(LONG_S)
+
+
+def told_at(address: str, args: argparse.Namespace, console: Console) -> None:
+    """Say where a viewer is served, and open it where a browser is and may be."""
+    Console().print(f"{address}  (Ctrl-C ends it)", soft_wrap=True, markup=False, highlight=False)
+    if not args.no_browser and not _browse(address):
+        console.print("no browser found: open that address in one", markup=False)
 
 
 def _open_report(args: argparse.Namespace) -> None:

@@ -165,13 +165,14 @@ class LiveLoop:
         """The static points of all keyframes so far, where they are now; empty until there is depth."""
         return self.keyframes.cloud()
 
-    def path(self) -> Array:
-        """(n, 4, 4) world_from_cam of all frames that have a place in the map, as it is now."""
+    def path(self) -> tuple[Array, Array]:
+        """(n,) times in seconds and (n, 4, 4) world_from_cam of all frames with a place in the map, as it is now."""
         graph = self.slam.graph
         placed = [r for r in graph.records if r.state != "lost" and graph.submap_of.get(r.kf_id) in graph.started]
         if not placed:
-            return np.zeros((0, 4, 4))
-        return np.stack([inverse(r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world) for r in placed])
+            return np.zeros(0), np.zeros((0, 4, 4))
+        poses = [inverse(r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world) for r in placed]
+        return np.array([r.timestamp_s for r in placed]), np.stack(poses)
 
     def _frames(self) -> Iterator[CameraFrame]:
         """In the camera's thread: what comes, kept where that is wanted."""

@@ -36,8 +36,8 @@ class LiveView(Protocol):
         """A frame has been tracked; its ``moving`` may still be in the making."""
         ...
 
-    def cloud(self, cloud: StaticCloud, path: Array) -> None:
-        """The static points and the path (n, 4, 4) world_from_cam as they are now: after a new keyframe."""
+    def cloud(self, cloud: StaticCloud, times_s: Array, path: Array) -> None:
+        """The static points, times (n,) and poses (n, 4, 4) world_from_cam as they are now: after a new keyframe."""
         ...
 
 
@@ -122,7 +122,7 @@ class _Teller:
         count, now = len(self._loop.slam.graph.keyframes), time.monotonic()
         if count != self._keyframes and now - self._cloud_at > CLOUD_EVERY_S:
             self._keyframes, self._cloud_at = count, now
-            self._view.cloud(self._loop.cloud(), self._loop.path())
+            self._view.cloud(self._loop.cloud(), *self._loop.path())
 
     def say(self) -> None:
         """The state in one line, and what has happened to the camera."""

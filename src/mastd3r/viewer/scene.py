@@ -138,6 +138,11 @@ class Scene:
         self._on_select(index)
 
     @property
+    def count(self) -> int:
+        """Frames so far."""
+        return len(self._path)
+
+    @property
     def selected(self) -> int:
         """Index of the frame under the slider, -1 where there is none."""
         return self._selected
