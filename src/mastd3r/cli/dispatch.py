@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 import logging
 
-from rich.console import Console
 from rich.logging import RichHandler
 
 from .parser import parser
+from .screen import screen
 
 
 def dispatch(words: list[str]) -> int:
     """Parse and run one command; returns the exit code."""
     args = parser().parse_args(words)
-    console = Console(stderr=True)
+    console = screen(stderr=True)
     shown = _log_level(args)
     terminal = RichHandler(shown, console=console, show_path=False, show_time=False)
     logging.basicConfig(level=shown, format="%(message)s", handlers=[terminal], force=True)

@@ -14,6 +14,7 @@ from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
 from .download import download_parser
+from .options import path
 from .weights import weights_parser
 
 INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
@@ -42,19 +43,19 @@ def parser() -> argparse.ArgumentParser:
     known = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(known.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
     again = known.add_parser("resume", help="go on with a run that was stopped, from its last checkpoint")
-    again.add_argument("run", type=Path, help="run folder; source and options are those that it was started with")
+    again.add_argument("run", type=path, help="run folder; source and options are those that it was started with")
     again.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     again.set_defaults(act=commands.resume)
     _map_parser(known.add_parser("map", help="go on with the map of a run that has ended"))
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
-    demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
+    demo.add_argument("--out", type=path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
     demo.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     _export_parser(known.add_parser("export", help="write a run for other tools"))
     view = known.add_parser("view", help="open a run's report in the browser")
-    view.add_argument("run", type=Path, help="run folder")
+    view.add_argument("run", type=path, help="run folder")
     view.set_defaults(act=commands.view)
     bench_parser(known.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(known.add_parser("weights", help="list, download and check the weights of the networks"))
@@ -65,21 +66,21 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _map_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("run", type=Path, help="run folder; its splat, poses, renders, figures and report are renewed")
+    p.add_argument("run", type=path, help="run folder; its splat, poses, renders, figures and report are renewed")
     p.add_argument("--minutes", type=float, metavar="M", help="of training (default: as the run's config.yaml says)")
     p.add_argument(
         "--quality", choices=get_args(MapQualityKind), help="instead of the run's; the map never becomes coarser"
     )
-    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument("--source", type=path, help="where the photographs are now (default: where the run read them)")
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=commands.train_map)
 
 
 def _export_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("run", type=Path, help="run folder")
+    p.add_argument("run", type=path, help="run folder")
     p.add_argument("--to", choices=tuple(KINDS), required=True, help="; ".join(f"{k}: {v}" for k, v in KINDS.items()))
-    p.add_argument("--out", type=Path, required=True, help="file or folder to write")
-    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument("--out", type=path, required=True, help="file or folder to write")
+    p.add_argument("--source", type=path, help="where the photographs are now (default: where the run read them)")
     p.add_argument(
         "--undistort",
         action=argparse.BooleanOptionalAction,
@@ -91,23 +92,23 @@ def _export_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _eval_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("paths", type=Path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
-    p.add_argument("--trajectory", type=Path, metavar="FILE", help="poses that another system has written")
+    p.add_argument("paths", type=path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
+    p.add_argument("--trajectory", type=path, metavar="FILE", help="poses that another system has written")
     p.add_argument("--format", choices=("tum", "kitti", "euroc"), help="of that file")
-    p.add_argument("--out", type=Path, metavar="FILE", help="with --trajectory: write the figures as JSON")
+    p.add_argument("--out", type=path, metavar="FILE", help="with --trajectory: write the figures as JSON")
     p.set_defaults(act=commands.evaluate_run)
 
 
 def _run_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("source", type=Path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
-    p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("source", type=path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
+    p.add_argument("--out", type=path, required=True, help="run folder")
     p.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
-    p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
+    p.add_argument("--config", type=path, help="YAML file with options that differ from the defaults")
     p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once; paper: everything as printed")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
     p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
-    p.add_argument("--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp")
+    p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)

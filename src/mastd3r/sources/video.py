@@ -23,6 +23,7 @@ from .grey_levels import GreyRange, range_of, spread
 from .image_files import read_probability
 from .interlacing import deinterlaced, interlacing_of
 from .notes import Notes
+from .photographs import BrokenBeside
 from .semantic_maps import match_maps
 
 Array = NDArray[Any]
@@ -128,7 +129,7 @@ class VideoSource:
 
     def frames(self) -> Iterator[Frame]:
         """Frame after frame. Broken ones are left out and noted. Raises InputError where the size changes."""
-        given = 0
+        given, broken_maps = 0, BrokenBeside(self._notes, "maps")
         decoded: Iterator[_Decoded] = self._decoded(note_end=True)
         if self._interlacing is not None:
             decoded = deinterlaced(decoded, self._interlacing)
@@ -140,7 +141,8 @@ class VideoSource:
             check_same_size(image, where, self.size, "the first frame")
             semantic = None
             if self._want_semantic and d.index in self._semantic:
-                semantic = read_probability(self._semantic[d.index])
+                with broken_maps.noted(self._semantic[d.index]):
+                    semantic = read_probability(self._semantic[d.index])
             given += 1
             yield Frame(d.index, d.timestamp_s, image, semantic=semantic)
         self.length = given
