@@ -22,7 +22,7 @@ from typing import Any
 from fuzz.case import KINDS, Case, Room
 from fuzz.material import Shared
 
-LONGEST_S, KILLED_S = 10.0, 20.0  # a command may take so long; one that takes this long hangs
+LONGEST_S, KILLED_S = 10.0, 60.0  # a command may work so long; one that is not done by then hangs
 MOST_BYTES = 3 * 2**29  # 1.5 GiB
 ROOM_BYTES = 5 * 2**29  # of address space beside what the interpreter has mapped already
 HASHED_BYTES = 2**22  # of a file; larger ones are sparse
@@ -38,6 +38,7 @@ class Outcome:
     words: list[str]
     code: int | None = None  # None: killed
     wall_s: float = 0.0
+    cpu_s: float = 0.0
     peak_mib: float = 0.0
     out: str = ""
     err: str = ""
@@ -80,6 +81,7 @@ def _run(case: Case, room: Room, outcome: Outcome) -> None:
         else:
             time.sleep(0.004)
     outcome.wall_s = time.monotonic() - began
+    outcome.cpu_s = usage.ru_utime + usage.ru_stime
     outcome.peak_mib = usage.ru_maxrss / 1024
     outcome.code = None if status is None else os.waitstatus_to_exitcode(status)
     outcome.out, outcome.err = _text(room.path / "stdout"), _text(room.path / "stderr")
@@ -150,7 +152,7 @@ def _judge(outcome: Outcome, before: dict[str, Any], after: dict[str, Any], runn
     shown = [c for c in outcome.out + outcome.err if not (c.isprintable() or c == "\n")]
     found = {
         "traceback": outcome.code in (1, 99) or "Traceback (most recent call last)" in outcome.err + outcome.out,
-        "hang": outcome.code is None or outcome.wall_s > LONGEST_S,
+        "hang": outcome.code is None or outcome.cpu_s > LONGEST_S,
         "running": bool(running),
         "lines": bool(refused and (len(ours) != 1 or lines[-1:] != ours or rest)),
         "control": bool(shown),

@@ -33,7 +33,7 @@ def archives(rng: random.Random, room: Room, shared: Shared) -> Case:
     file = room.given / "x.tgz"
     which = rng.randrange(5)
     if which == 0:
-        nasty(rng, file, _zip(rng))
+        nasty(rng, file, _zip(rng), 2**26)
     elif which in (1, 2):
         file.write_bytes(_tar(rng))
     elif which == 3:
@@ -182,7 +182,7 @@ def weights(rng: random.Random, room: Room, shared: Shared) -> Case:
     file = room.given / f"w.{rng.choice(('safetensors', 'pth', 'pt'))}"
     which = rng.randrange(6)
     if which == 0:
-        nasty(rng, file, b"PK\x03\x04" + b"\0" * 30)
+        nasty(rng, file, b"PK\x03\x04" + b"\0" * 30, 2**26)
     elif which == 1:
         head = json.dumps({"a": {"dtype": rng.choice(("F32", "X")), "shape": rng.choice(([10**9, 10**9], [-1], [2], "x")),
                                  "data_offsets": rng.choice(([0, 8], [0, 10**18], [5, 1], [-1, 3]))}}).encode()  # fmt: skip
@@ -192,7 +192,7 @@ def weights(rng: random.Random, room: Room, shared: Shared) -> Case:
     elif which == 3:
         file.write_bytes(b"\x80\x02cos\nsystem\n(S'touch /tmp/never'\ntR.")
     elif which == 4:
-        sparse(file, struct.pack("<Q", 2) + b"{}")
+        sparse(file, struct.pack("<Q", 2) + b"{}", 2**26)
     else:
         file.write_bytes(rng.randbytes(200))
     words: list[list[str | Path]] = [

@@ -16,6 +16,7 @@ from mastd3r.export.kinds import KINDS as FORMATS
 
 WEIGHTED = ("run.json",) * 3 + ("camera.json", "camera.json", "trajectory.txt", "metrics.json", "config.yaml", "cloud.ply",
             "gaussians.ply", "tracks.npz", "keyframes.txt", "report.html")  # fmt: skip
+DRAWN = ("flight", "depth", "plates", "mesh", "cloud")  # formats that need kernels
 HEADER_WORDS = ("vertex 10", "vertex -1", "vertex 99999999999", "vertex x", "vertex 0", "vertex nan", "vertex ²")
 PROPERTIES = (
     "property double x",
@@ -29,7 +30,7 @@ PROPERTIES = (
 
 def commands_on(rng: random.Random, run: Path, room: Room, shared: Shared) -> list[str | Path]:
     """One of the commands that read a run folder."""
-    form = rng.choice(tuple(FORMATS))
+    form = rng.choice(tuple(f for f in FORMATS if not (shared.quick and f in DRAWN)))
     photos = shared.run.parent / "photos"
     suffix = {"flight": ".mp4", "mesh": ".ply", "cloud": ".ply", "spz": ".spz"}.get(form, "")
     words: list[list[str | Path]] = [
@@ -39,7 +40,7 @@ def commands_on(rng: random.Random, run: Path, room: Room, shared: Shared) -> li
         ["eval", run, photos],
         ["view", run],
         ["resume", run, "--quiet"],
-        ["map", run, "--minutes", "0.001", "--quiet"],
+        ["map", run, "--minutes", "nan" if shared.quick else "0.001", "--quiet"],
         ["run", shared.one_image, "--out", run, "--no-map", "--quiet"],
     ]  # fmt: skip
     return rng.choice(words)
@@ -136,9 +137,13 @@ def ply_headers(rng: random.Random, room: Room, shared: Shared) -> Case:
             floats[at : at + 4] = rng.choice((b"\0\0\xc0\x7f", b"\0\0\x80\x7f", b"\xff\xff\x7f\x7f", b"\0\0\x80\xff"))
         body = bytes(floats)
     (run / name).write_bytes("\n".join(lines).encode() + b"\n" + end + body)
-    forms = ("colmap", "nerfstudio", "plates") if name == "cloud.ply" else ("spz", "flight", "depth", "plates")
+    forms = (
+        ("colmap", "nerfstudio")
+        if name == "cloud.ply"
+        else ("spz", *(() if shared.quick else ("flight", "depth", "plates")))
+    )
     words: list[str | Path] = ["export", run, "--to", rng.choice(forms), "--out", room.path / "exported", "--quiet"]
-    if rng.random() < 0.2:
+    if rng.random() < 0.2 and not shared.quick:
         words = ["map", run, "--minutes", "0.001", "--quiet"]
     return Case(words)
 

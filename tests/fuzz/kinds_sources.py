@@ -24,8 +24,9 @@ TEXTS = (
 SIZES = ((2, 2), (4000, 20), (20, 4000), (16, 16), (8000, 8), (1000, 2), (64, 2))
 
 
-def run_of(source: Path | str, room: Room, *words: str | Path) -> Case:
-    return Case(["run", source, "--out", room.out, "--no-map", "--quiet", "--end=3", *words])
+def run_of(source: Path | str, room: Room, shared: Shared, *words: str | Path) -> Case:
+    end = f"--end={1 if shared.quick else 3}"
+    return Case(["run", source, "--out", room.out, "--no-map", "--quiet", end, *words])
 
 
 @kind("videos", 70)
@@ -48,7 +49,7 @@ def videos(rng: random.Random, room: Room, shared: Shared) -> Case:
         path.write_bytes(data)
     else:
         path.write_bytes(garbled(rng, shared.video))
-    return run_of(path, room)
+    return run_of(path, room, shared)
 
 
 @kind("image files", 80)
@@ -72,7 +73,7 @@ def image_files(rng: random.Random, room: Room, shared: Shared) -> Case:
             path.write_bytes(garbled(rng, good))
         else:
             path.write_bytes(good)
-    return run_of(room.given, room)
+    return run_of(room.given, room, shared)
 
 
 def _odd_image(rng: random.Random) -> bytes:
@@ -113,7 +114,7 @@ def folders(rng: random.Random, room: Room, shared: Shared) -> Case:
     source = rng.choice(
         (at, at, at, "~nobody/x", "/dev/zero", "/dev/stdin", "/dev/null", "-", ".", "", "/proc/self/mem")
     )
-    return run_of(source, room, f"--kind={rng.choice(kinds)}")
+    return run_of(source, room, shared, f"--kind={rng.choice(kinds)}")
 
 
 @kind("datasets", 60)
@@ -130,7 +131,7 @@ def datasets(rng: random.Random, room: Room, shared: Shared) -> Case:
             path.write_text(garbled_text(rng, data.decode()), encoding="utf-8", errors="replace", newline="")
         else:
             nasty(rng, path, data)
-    return Case(["run", made.folder, "--out", room.out, "--no-map", "--quiet", "--end=2"])
+    return run_of(made.folder, room, shared)
 
 
 def sequence(room: Room, count: int = 3) -> Path:
@@ -181,7 +182,7 @@ def lists_and_truth(rng: random.Random, room: Room, shared: Shared) -> Case:
             nasty(rng, path, text.encode())
     if rng.random() < 0.6:
         return Case(["eval", "--trajectory", room.given / "est.txt", "--format", "tum", folder])
-    return Case(["run", folder, "--out", room.out, "--no-map", "--quiet", "--end=3"])
+    return run_of(folder, room, shared)
 
 
 @kind("maps and depth", 60)
@@ -198,7 +199,7 @@ def maps_and_depth(rng: random.Random, room: Room, shared: Shared) -> Case:
             continue
         _numbers_file(rng, path)
     words = ["--pointmaps=depth"] if where == "depth" else ["--maps", room.given / "maps"] if where == "maps" else []
-    return run_of(folder, room, *words)
+    return run_of(folder, room, shared, *words)
 
 
 def _numbers_file(rng: random.Random, path: Path) -> None:

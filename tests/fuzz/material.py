@@ -43,6 +43,9 @@ class Shared:
     """Good inputs that cases copy; made when they are first wanted."""
 
     root: Path
+    quick: bool = (
+        False  # cases end before anything is tracked or drawn: kernels that are not compiled yet take a minute
+    )
 
     @cached_property
     def one_image(self) -> Path:
@@ -132,7 +135,7 @@ def garbled_text(rng: random.Random, text: str) -> str:
     return rng.choice((text, text, "\ufeff" + text, text.replace(" ", ","), text.replace(" ", "\t")))
 
 
-def nasty(rng: random.Random, path: Path, good: bytes = b"") -> None:
+def nasty(rng: random.Random, path: Path, good: bytes = b"", huge: int = HUGE_BYTES) -> None:
     """Put something at ``path`` that is not what belongs there."""
     kinds: tuple[Callable[[], object], ...] = (
         lambda: os.mkfifo(path),
@@ -143,7 +146,7 @@ def nasty(rng: random.Random, path: Path, good: bytes = b"") -> None:
         lambda: path.write_bytes(b""),
         lambda: path.write_bytes(rng.randbytes(rng.choice((1, 100, 5000)))),
         lambda: path.write_bytes(b"\0" * 5000),
-        lambda: sparse(path),
+        lambda: sparse(path, size=huge),
         lambda: _socket(path),
     )
     if path.is_symlink() or path.exists():

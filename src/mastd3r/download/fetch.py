@@ -25,6 +25,7 @@ from typing import Any, BinaryIO
 
 from ..errors import InputError, OutputError
 from ..reading.files import check_plain, short, user_path, whole_json, why
+from .http import OPENER, whole_number
 
 CHUNK_BYTES = 1 << 20
 AGENT = "mastd3r-slam"
@@ -32,7 +33,7 @@ TRANSIENT = {408, 425, 429, 500, 502, 503, 504}  # HTTP answers worth another tr
 MAX_PAUSE_S = 30.0
 SLOWEST_BYTES_S = 1000.0  # over as long as an answer may take to begin; a connection that is slower counts as cut
 TOO_SLOW = f"slower than {SLOWEST_BYTES_S:.0f} bytes a second"
-MOST_NOTE_BYTES, MOST_DIGITS = 2**16, 18  # of what is kept beside a part; of a number in a header
+MOST_NOTE_BYTES = 2**16  # of what is kept beside a part
 
 Progress = Callable[[int, int | None], None]  # (bytes that are there, bytes in all or None where unknown)
 
@@ -208,7 +209,7 @@ class _Transfer:
                 raise InputError(
                     f"{self.url}: expected a file to download, got HTTP {e.code} {short(str(e.reason))}"
                 ) from e
-            self.wait_s = float(_whole(e.headers.get("Retry-After")) or 0)
+            self.wait_s = float(whole_number(e.headers.get("Retry-After")) or 0)
             return f"HTTP {e.code}"
         except _Again as e:
             self.forget()
@@ -239,7 +240,7 @@ class _Transfer:
             if validator := _strong(note):
                 headers["If-Range"] = validator
         request = urllib.request.Request(self.url, headers=headers)
-        with _OPENER.open(request, timeout=self.timeout_s) as answer:
+        with OPENER.open(request, timeout=self.timeout_s) as answer:
             self.answered = True
             start = self._start(answer, have, note)
             with _writing(self.part), self.part.open("r+b" if start else "wb", buffering=0) as file:
@@ -252,7 +253,7 @@ class _Transfer:
         """Where this answer begins in the file; 0 begins again. Raises _Again, InputError, OutputError."""
         if answer.headers.get("Content-Encoding", "identity") != "identity":
             raise InputError(f"{self.url}: expected the file as it is, got it encoded by the server")
-        start, total = 0, _whole(answer.headers.get("Content-Length"))
+        start, total = 0, whole_number(answer.headers.get("Content-Length"))
         if answer.status == http.HTTPStatus.PARTIAL_CONTENT:
             span = re.fullmatch(
                 r"bytes ([0-9]{1,18})-[0-9]{1,18}/([0-9]{1,18}|\*)", answer.headers.get("Content-Range", "")
@@ -299,23 +300,6 @@ class _Transfer:
     def _write_note(self, note: dict[str, Any]) -> None:
         with _writing(self.note_path):
             self.note_path.write_text(json.dumps(note), encoding="utf-8")
-
-
-class _HttpOnly(urllib.request.HTTPRedirectHandler):
-    """A server sends nobody to other protocols, such as FTP."""
-
-    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
-        if newurl.partition(":")[0].lower() not in ("http", "https"):
-            raise InputError(f"{req.full_url}: expected http or https, the server sends to {short(newurl)}")
-        return super().redirect_request(req, fp, code, msg, headers, newurl)
-
-
-_OPENER = urllib.request.build_opener(_HttpOnly)
-
-
-def _whole(text: str | None) -> int | None:
-    """A whole number of a header; None for anything else."""
-    return int(text) if text and text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS else None
 
 
 class _NetworkTrouble(ConnectionError):

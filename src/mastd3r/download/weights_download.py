@@ -179,7 +179,7 @@ def _hub_files(hub_id: str, revision: str) -> list[KnownFile]:
             if not isinstance(size, int | None) or not isinstance(sha256, str | None):
                 raise TypeError(f"size {short(repr(size))}, sha256 {short(repr(sha256))}")
             files.append(KnownFile(str(entry["rfilename"]), size, sha256))
-    except (ValueError, KeyError, TypeError, AttributeError) as e:
+    except (InputError, KeyError, TypeError, AttributeError) as e:
         raise InputError(f"{hub()}/{hub_id}: expected a list of files, got something else ({e})") from e
     finally:
         listing.unlink(missing_ok=True)

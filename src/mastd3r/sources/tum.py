@@ -69,7 +69,8 @@ class TumSource:
         if found:
             self._notes.put("found", f"{self.kind}: {found}")
         self._folder = folder
-        self._info = _read_info(folder / "info.json", self._notes)
+        self._want_depth, self._want_semantic = want_depth, want_semantic
+        self._info = _read_info(folder / "info.json", self._notes, needed=want_depth)
         self._rows = self._present(file_rows(folder / "rgb.txt"), folder / "rgb.txt")
         _check_ascending(self._rows, folder / "rgb.txt")
         self._chosen = window(config, len(self._rows), str(folder / "rgb.txt"))
@@ -94,7 +95,6 @@ class TumSource:
         else:
             self._semantic = self._associated("semantic.txt")
         self.has_depth, self.has_semantic = bool(self._depth), bool(self._semantic)
-        self._want_depth, self._want_semantic = want_depth, want_semantic
         self._true = self._read_truth()  # now: what is wrong with it is told before anything is computed
 
     def frames(self) -> Iterator[Frame]:
@@ -202,6 +202,8 @@ class TumSource:
         return float(value)
 
     def _left_out(self, why: str) -> None:
+        if self._want_depth:  # the scale of its depth is in there
+            raise InputError(f"{self._folder / 'info.json'}: {why}")
         self._notes.put("info", f"info.json is not used as a whole: {why}")
 
 
@@ -209,11 +211,13 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
 
 
-def _read_info(path: Path, notes: Notes) -> dict[str, Any]:
-    """info.json; nothing, with a note, where it cannot be read: no run needs it."""
+def _read_info(path: Path, notes: Notes, needed: bool) -> dict[str, Any]:
+    """info.json; nothing, with a note, where it cannot be read and is not ``needed``."""
     try:
         return whole_json(path, "JSON") if os.path.lexists(path) else {}
     except InputError as e:
+        if needed:
+            raise
         notes.put("info", f"info.json is left out: {e}")
         return {}
 
