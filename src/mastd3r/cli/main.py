@@ -29,12 +29,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     from .signals import stopping_signals
 
     words = list(sys.argv[1:] if argv is None else argv)
+    _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):  # names of files may be what its encoding does not have
             stream.reconfigure(errors="backslashreplace")
     try:
         with stopping_signals():
-            return dispatch(words)
+            code = dispatch(words)
+            if sys.stdout is not None:
+                sys.stdout.flush()  # not when the interpreter ends, who would complain in words of its own
+            return code
     except (SlamError, MemoryError) as e:
         say(reason_of(e), e)
         return EXIT_BAD_INPUT
@@ -43,10 +47,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         say(f"stopped; {KEPT_BY.get(command, KEPT)}", e)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 0
     except Exception as e:  # noqa: BLE001  the boundary that nothing passes
         say(reason_of(e), e if hasattr(e, "__notes__") else _kept(e))
         return EXIT_FAULT
+
+
+def _open_what_is_closed() -> None:
+    """Without this a file of the run would become standard output, and take what libraries print."""
+    for number in (0, 1, 2):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
 
 
 def say(line: str, error: BaseException) -> None:

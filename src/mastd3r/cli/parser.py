@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import re
 from pathlib import Path
 from typing import NoReturn, get_args
 
@@ -10,6 +12,7 @@ from .. import __version__
 from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..export.kinds import KINDS
+from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
@@ -17,6 +20,7 @@ from .download import download_parser
 from .options import path
 from .weights import weights_parser
 
+MOST_SHOWN = 400  # characters of what argparse says
 INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
 QUALITY_HELP = (
     "image width, steps and number of Gaussians of the map, more on an accelerator than on the CPU "
@@ -33,7 +37,29 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, as everything else does."""
 
     def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message}; see {self.prog} --help")
+        raise ConfigError(f"{short(message, MOST_SHOWN)}{self._near(message)}; see {self.prog} --help")
+
+    def _near(self, message: str) -> str:
+        """What was perhaps meant, of the commands, choices and options there are."""
+        unknown = re.search(r"unrecognized arguments: (--?[\w-]+)|invalid choice: '([^']*)'", message)
+        if unknown is None:
+            return ""
+        word = unknown[1] or unknown[2]
+        near = difflib.get_close_matches(word, self._options() if unknown[1] else self._choices(message), n=1)
+        return f"; perhaps you meant {near[0]}" if near else ""
+
+    def _options(self) -> list[str]:
+        own = [word for action in self._actions for word in action.option_strings]
+        commands = [c for a in self._actions if isinstance(a.choices, dict) for c in a.choices.values()]
+        return own + [word for command in commands for word in command._options()]
+
+    def _choices(self, message: str) -> list[str]:
+        named = [a for a in self._actions if a.choices and message.startswith(f"argument {_name_of(a)}:")]
+        return [str(choice) for action in named for choice in action.choices or ()]
+
+
+def _name_of(action: argparse.Action) -> str:
+    return "/".join(action.option_strings) or str(action.metavar or action.dest)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -62,6 +88,8 @@ def parser() -> argparse.ArgumentParser:
     download_parser(known.add_parser("download", help="list and bring the public datasets"))
     doctor = known.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=commands.doctor)
+    for command in known.choices.values():
+        command.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help="say more")
     return top
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
@@ -33,8 +35,16 @@ class _Hook(RenderHook):
         return [_Plain(r) for r in renderables]
 
 
+class _Screen(Console):
+    def on_broken_pipe(self) -> None:
+        """Nobody reads any more (``| head``): nothing more is shown, and the work goes on."""
+        self.quiet = True
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
 def screen(*, stderr: bool = False) -> Console:
     """A console for results, or with ``stderr`` for all that is said on the way."""
-    console = Console(stderr=stderr)
+    console = _Screen(stderr=stderr)
     console.push_render_hook(_Hook())
     return console

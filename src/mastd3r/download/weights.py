@@ -12,6 +12,7 @@ import json
 import os
 import re
 import sys
+import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -61,12 +62,17 @@ def home() -> Path:
     if chosen := os.environ.get("MASTD3R_HOME"):
         return Path(chosen).expanduser()
     if sys.platform == "win32":
-        cache = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+        cache = os.environ.get("LOCALAPPDATA") or _user() / "AppData" / "Local"
     elif sys.platform == "darwin":
-        cache = Path.home() / "Library" / "Caches"
+        cache = _user() / "Library" / "Caches"
     else:
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        cache = os.environ.get("XDG_CACHE_HOME") or _user() / ".cache"
     return Path(cache) / "mastd3r"
+
+
+def _user() -> Path:
+    """The user's own folder; that of the system for the time being, for a user without (in containers)."""
+    return Path(own) if (own := os.path.expanduser("~")) != "~" else Path(tempfile.gettempdir())
 
 
 def folder_of(name: str) -> Path:

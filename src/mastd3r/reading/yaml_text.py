@@ -11,12 +11,23 @@ from .files import Refusal, whole_text
 
 MOST_YAML_BYTES = 2**20
 MOST_NODES = 50_000  # with what aliases stand for
+MOST_DEEP = 50
 EXPECTED = "readable YAML"
-BROKEN = (yaml.YAMLError, ValueError, LookupError, TypeError, OverflowError, RecursionError)
+BROKEN = (yaml.YAMLError, ValueError, LookupError, TypeError, OverflowError)
 
 
 class _Loader(yaml.SafeLoader):
-    """Dates and the like are text."""
+    """Dates and the like are text; nothing is nested deeply."""
+
+    deep = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.deep += 1
+        if self.deep > MOST_DEEP:
+            raise ValueError(f"nesting of more than {MOST_DEEP}")
+        node = super().compose_node(parent, index)
+        self.deep -= 1
+        return node
 
     def as_text(self, node: Any) -> Any:
         return self.construct_scalar(node)
@@ -37,8 +48,8 @@ def yaml_value(text: str, where: str, refusal: Refusal, expected: str = EXPECTED
             raise ValueError(f"more than {MOST_NODES} values")
         return loader.construct_document(node)
     except BROKEN as e:
-        said = "nesting that is too deep" if isinstance(e, RecursionError) else " ".join(str(e).split())
-        raise refusal(f"{where}: expected {expected}, got {said or type(e).__name__}") from e
+        said = " ".join(str(e).split()) or type(e).__name__
+        raise refusal(f"{where}: expected {expected}, got {said}") from e
 
 
 def yaml_file(path: Path, where: str, refusal: Refusal) -> Any:

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import resolved
+from ..reading.pictures import check_pixels
 from ..types import Frame, Truth
 from .checks import check_same_size, check_window, window
 from .grey_levels import GreyRange, range_of, spread
@@ -31,6 +33,7 @@ Turn = tuple[int, int, int, int]  # row-major 2x2 of 0, 1, -1: (x, y) as stored 
 UPRIGHT: Turn = (1, 0, 0, 1)
 FALLBACK_FPS = Fraction(30)
 GREY = "gray16le"
+LOCAL_ONLY = {"protocol_whitelist": "file"}  # a playlist reads nothing from the net
 ATTACHED_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
@@ -238,7 +241,7 @@ class VideoSource:
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first real video stream. Raises InputError."""
     try:
-        container = av.open(str(path.resolve()))
+        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY)
     except av.FFmpegError as e:
         raise InputError(f"{path}: {_why_not(path)}") from e
     with container:
@@ -249,6 +252,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             raise InputError(
                 f"{path}: expected a video, got a {container.format.name} file without moving pictures that can be read"
             )
+        check_pixels((stream.codec_context.width, stream.codec_context.height), str(path))
         yield container, stream
 
 
