@@ -178,8 +178,7 @@ def test_a_record_is_refused_by_the_name_of_its_field(field: str, value: object)
 def test_a_camera_and_figures_are_refused_by_the_name_of_their_field(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
     good = (
-        '{"fx_px": 60.0, "fy_px": 60.0, "cx_px": 31.5, "cy_px": 23.5, "width": 64, "height": 48,'
-    good += ' "distortion": [0, 0]}'
+        '{"fx_px": 60.0, "fy_px": 60.0, "cx_px": 31.5, "cy_px": 23.5, "width": 64, "height": 48, "distortion": [0, 0]}'
     )
     path.write_text(good)
     assert checked_camera(path)[0].width == 64
