@@ -33,22 +33,14 @@ def warm() -> None:
 
 def compile_kernels(root: Path, shared: Shared) -> None:
     """Good input once through everything, so that no bad input is charged with compiling: into numba's own cache."""
-    photos = shared.run.parent / "photos"
-    for n, words in enumerate((
-        ["run", str(miniatures.tum_rgbd(root / "mini", count=12, size=(160, 120)).folder), "--no-map", "--pointmaps=depth"],
-        ["run", str(room_clip(root / "clip")), "--no-map"],
-        *(["export", str(shared.run), "--to", f] for f in ("flight.mp4", "depth", "plates", "mesh.ply", "cloud.ply")),
-        ["map", str(shutil.copytree(shared.run, root / "copy")), "--minutes", "0.001"],
-        ["eval", str(shared.run), str(photos)],
-    )):  # fmt: skip
-        form, _, suffix = words[-1].partition(".") if words[0] == "export" else ("", "", "")
-        words = [*words[:-1], form] if form else words
-        out = (
-            ["--out", str(root / f"good-{n}") + (f".{suffix}" if suffix else "")]
-            if words[0] in ("run", "export")
-            else []
-        )
-        in_a_child([*words, *out])
+    depth = miniatures.tum_rgbd(root / "mini", count=12, size=(160, 120)).folder
+    runs = [["run", str(depth), "--pointmaps=depth"], ["run", str(room_clip(root / "clip"))]]
+    for n, words in enumerate(runs):
+        in_a_child([*words, "--no-map", "--out", str(root / f"good-{n}")])
+    for name in ("flight.mp4", "depth", "plates", "mesh.ply", "cloud.ply"):
+        in_a_child(["export", str(shared.run), "--to", name.partition(".")[0], "--out", str(root / f"good-{name}")])
+    in_a_child(["map", str(shutil.copytree(shared.run, root / "copy")), "--minutes", "0.001"])
+    in_a_child(["eval", str(shared.run), str(shared.run.parent / "photos")])
 
 
 def in_a_child(words: list[str]) -> None:
@@ -136,7 +128,10 @@ def as_table(summary: dict[str, Any]) -> str:
     rows = {**summary["kinds"], "all": {"cases": summary["cases"], **summary["faults"]}}
     lines += [f"{k:22} {c['cases']:5} " + " ".join(f"{c[f]:9}" for f in FAULTS) for k, c in rows.items()]
     codes = ", ".join(f"{code}: {n}" for code, n in summary["exit codes"].items())
-    extremes = f"longest {summary['longest_s']} s ({summary['longest_cpu_s']} s of work), at most {summary['peak_mib']} MiB, all in {summary['wall_s']} s"
+    work = f"({summary['longest_cpu_s']} s of work)"
+    extremes = (
+        f"longest {summary['longest_s']} s {work}, at most {summary['peak_mib']} MiB, all in {summary['wall_s']} s"
+    )
     return "\n".join([*lines, f"exit codes {codes}; {extremes}"])
 
 

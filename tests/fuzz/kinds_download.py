@@ -20,9 +20,23 @@ from fuzz.case import Case, Room, kind
 from fuzz.material import Shared, garbled, nasty, sparse
 
 MEMBERS = (
-    "a/b.txt", "../x", "/etc/x", "a/" * 2000 + "x", "n" * 300, "a\x1b[2J", "C:\\x", "a\0b", "é\udcff", "rgb.txt",
-    "a/../../x", ".", "con", "[/x]", "a\nb", "x" * 100 + "/" + "y" * 200,
-)  # fmt: skip
+    "a/b.txt",
+    "../x",
+    "/etc/x",
+    "a/" * 2000 + "x",
+    "n" * 300,
+    "a\x1b[2J",
+    "C:\\x",
+    "a\0b",
+    "é\udcff",
+    "rgb.txt",
+    "a/../../x",
+    ".",
+    "con",
+    "[/x]",
+    "a\nb",
+    "x" * 100 + "/" + "y" * 200,
+)
 BOMB_BYTES = 60 * 2**20  # of zeros
 NAME = "rgbd_dataset_freiburg1_xyz"
 
@@ -80,9 +94,14 @@ def _tar(rng: random.Random) -> bytes:
             info.linkname = "../../x"
             if rng.random() < 0.3 and form == tarfile.PAX_FORMAT:
                 sparse_map = rng.choice(("0,1", "0,99999999999", "x", "-1,5", ",".join(["1"] * 1001)))
-                info.pax_headers = {"GNU.sparse.major": rng.choice(("0", "1", "9", "x")), "GNU.sparse.minor": "0",
-                                    "GNU.sparse.map": sparse_map, "GNU.sparse.size": rng.choice(("10", "x", "-5", "9" * 30)),
-                                    "GNU.sparse.realsize": "99999999999", "GNU.sparse.name": rng.choice(MEMBERS[:4])}  # fmt: skip
+                info.pax_headers = {
+                    "GNU.sparse.major": rng.choice(("0", "1", "9", "x")),
+                    "GNU.sparse.minor": "0",
+                    "GNU.sparse.map": sparse_map,
+                    "GNU.sparse.size": rng.choice(("10", "x", "-5", "9" * 30)),
+                    "GNU.sparse.realsize": "99999999999",
+                    "GNU.sparse.name": rng.choice(MEMBERS[:4]),
+                }
             archive.addfile(info, io.BytesIO(data) if info.size else None)
     data = bytearray(buffer.getvalue())
     return bytes(data)
@@ -115,27 +134,54 @@ def _head(status: str, *lines: str) -> bytes:
 
 Answer = Callable[[int, random.Random], bytes]
 ANSWERS: tuple[Answer, ...] = (
-    lambda port, rng: _head("429 No", f"Retry-After: {rng.choice(('²', '-5', '1e9', '99999999999', 'Thu, 99 Foo', 'nan', ''))}"),
+    lambda port, rng: _head(
+        "429 No", f"Retry-After: {rng.choice(('²', '-5', '1e9', '99999999999', 'Thu, 99 Foo', 'nan', ''))}"
+    ),
     lambda port, rng: _head("503 No", "Retry-After: 0"),
     lambda port, rng: _head("302 Found", f"Location: http://127.0.0.1:{port}/x.pth"),
-    lambda port, rng: _head("302 Found", f"Location: {rng.choice(('ftp://127.0.0.1/x', 'file:///etc/passwd', 'http://[', '//', 'gopher://x', ''))}"),
+    lambda port, rng: _head(
+        "302 Found",
+        f"Location: {rng.choice(('ftp://127.0.0.1/x', 'file:///etc/passwd', 'http://[', '//', 'gopher://x', ''))}",
+    ),
     lambda port, rng: _head("302 Found"),
     lambda port, rng: _head("404 \x1b[2Jgone [/x]"),
     lambda port, rng: _head("403 a\x85b\x9bc"),
-    lambda port, rng: _head("200 OK", f"Content-Length: {rng.choice(('x', '-1', '99999999999999999999', '1e3', ''))}") + b"abc",
+    lambda port, rng: (
+        _head("200 OK", f"Content-Length: {rng.choice(('x', '-1', '99999999999999999999', '1e3', ''))}") + b"abc"
+    ),
     lambda port, rng: _head("200 OK", "Content-Length: 1000") + b"abc",
     lambda port, rng: _head("200 OK", "Transfer-Encoding: chunked") + b"zz\r\nabc",
-    lambda port, rng: _head("206 Part", f"Content-Range: {rng.choice(('bytes 5-9/10', 'x', 'bytes */*', 'bytes 0-²/3'))}") + b"abc",
+    lambda port, rng: (
+        _head("206 Part", f"Content-Range: {rng.choice(('bytes 5-9/10', 'x', 'bytes */*', 'bytes 0-²/3'))}") + b"abc"
+    ),
     lambda port, rng: b"\x16\x03\x01\x00" + b"\xff" * 50,
     lambda port, rng: b"",
     lambda port, rng: b"HTTP/1.1 " + b"x" * 100_000,
     lambda port, rng: b"HTTP/1.1 200 OK\r\n" + b"a: b\r\n" * 500 + b"\r\n",
-    lambda port, rng: _head("200 OK") + json.dumps({"siblings": rng.choice((None, 3, [None], [{}], [{"rfilename": 3}], "x", [{"rfilename": "a\x1b.safetensors"}], [{"rfilename": ".." , "size": "x"}]))}).encode(),
+    lambda port, rng: (
+        _head("200 OK")
+        + json.dumps(
+            {
+                "siblings": rng.choice(
+                    (
+                        None,
+                        3,
+                        [None],
+                        [{}],
+                        [{"rfilename": 3}],
+                        "x",
+                        [{"rfilename": "a\x1b.safetensors"}],
+                        [{"rfilename": "..", "size": "x"}],
+                    )
+                )
+            }
+        ).encode()
+    ),
     lambda port, rng: _head("200 OK") + b"[" * 100_000,
     lambda port, rng: _head("200 OK", f"ETag: {'x' * 3000}\x01", "Last-Modified: ²") + b"abc",
     lambda port, rng: b"drip",
     lambda port, rng: b"endless",
-)  # fmt: skip
+)
 
 
 def _serve(answer: Answer, port: int, seed: int) -> None:
@@ -184,8 +230,15 @@ def weights(rng: random.Random, room: Room, shared: Shared) -> Case:
     if which == 0:
         nasty(rng, file, b"PK\x03\x04" + b"\0" * 30, 2**26)
     elif which == 1:
-        head = json.dumps({"a": {"dtype": rng.choice(("F32", "X")), "shape": rng.choice(([10**9, 10**9], [-1], [2], "x")),
-                                 "data_offsets": rng.choice(([0, 8], [0, 10**18], [5, 1], [-1, 3]))}}).encode()  # fmt: skip
+        head = json.dumps(
+            {
+                "a": {
+                    "dtype": rng.choice(("F32", "X")),
+                    "shape": rng.choice(([10**9, 10**9], [-1], [2], "x")),
+                    "data_offsets": rng.choice(([0, 8], [0, 10**18], [5, 1], [-1, 3])),
+                }
+            }
+        ).encode()
         file.write_bytes(struct.pack("<Q", rng.choice((len(head), 2**63, 10**7, 0))) + head + b"\0" * 8)
     elif which == 2:
         file.write_bytes(_zip(rng))
@@ -200,7 +253,16 @@ def weights(rng: random.Random, room: Room, shared: Shared) -> Case:
         ["weights", "download", file, "--as", "mine", "--yes", "--quiet"],
         ["weights", "download", file, "--as", "mast3r", "--yes", "--quiet"],
         ["weights", "path", file],
-        ["run", shared.one_image, "--out", room.out, "--no-map", "--quiet", "--pointmaps=mast3r",
-         "--set", f"networks.mast3r={file}"],
-    ]  # fmt: skip
+        [
+            "run",
+            shared.one_image,
+            "--out",
+            room.out,
+            "--no-map",
+            "--quiet",
+            "--pointmaps=mast3r",
+            "--set",
+            f"networks.mast3r={file}",
+        ],
+    ]
     return Case(rng.choice(words))

@@ -14,8 +14,18 @@ from fuzz.case import Case, Room, kind
 from fuzz.material import NUMBERS, VALUES, Shared, garbled, garbled_text, nasty
 from mastd3r.export.kinds import KINDS as FORMATS
 
-WEIGHTED = ("run.json",) * 3 + ("camera.json", "camera.json", "trajectory.txt", "metrics.json", "config.yaml", "cloud.ply",
-            "gaussians.ply", "tracks.npz", "keyframes.txt", "report.html")  # fmt: skip
+WEIGHTED = ("run.json",) * 3 + (
+    "camera.json",
+    "camera.json",
+    "trajectory.txt",
+    "metrics.json",
+    "config.yaml",
+    "cloud.ply",
+    "gaussians.ply",
+    "tracks.npz",
+    "keyframes.txt",
+    "report.html",
+)
 DRAWN = ("flight", "depth", "plates", "mesh", "cloud")  # formats that need kernels
 HEADER_WORDS = ("vertex 10", "vertex -1", "vertex 99999999999", "vertex x", "vertex 0", "vertex nan", "vertex ²")
 PROPERTIES = (
@@ -36,13 +46,21 @@ def commands_on(rng: random.Random, run: Path, room: Room, shared: Shared) -> li
     words: list[list[str | Path]] = [
         ["export", run, "--to", form, "--out", room.path / f"exported{suffix}", "--quiet"],
         ["export", run, "--to", form, "--out", room.path / f"exported{suffix}", "--quiet"],
-        ["export", run, "--to", rng.choice(("colmap", "nerfstudio", "spz", "tum", "ros")), "--out", room.path / "x", "--quiet"],
+        [
+            "export",
+            run,
+            "--to",
+            rng.choice(("colmap", "nerfstudio", "spz", "tum", "ros")),
+            "--out",
+            room.path / "x",
+            "--quiet",
+        ],
         ["eval", run, photos],
         ["view", run],
         ["resume", run, "--quiet"],
         ["map", run, "--minutes", "nan" if shared.quick else "0.001", "--quiet"],
         ["run", shared.one_image, "--out", run, "--no-map", "--quiet"],
-    ]  # fmt: skip
+    ]
     return rng.choice(words)
 
 

@@ -18,9 +18,13 @@ from helpers import blobs, write_video
 
 SUFFIXES = ("mp4", "mkv", "avi", "mov", "webm", "gif", "m3u8", "sdp", "ts", "y4m", "jpg", "txt", "concat", "mpd", "svg")
 TEXTS = (
-    "ffconcat version 1.0\nfile /etc/passwd\n", "#EXTM3U\n#EXTINF:10,\nfile:///etc/passwd\n", "v=0\nc=IN IP4 127.0.0.1\n",
-    "YUV4MPEG2 W99999999 H99999999 F30:1\nFRAME\n", "<svg xmlns='http://www.w3.org/2000/svg' width='1e9'/>", "GIF89a" + "\xff" * 20,
-)  # fmt: skip
+    "ffconcat version 1.0\nfile /etc/passwd\n",
+    "#EXTM3U\n#EXTINF:10,\nfile:///etc/passwd\n",
+    "v=0\nc=IN IP4 127.0.0.1\n",
+    "YUV4MPEG2 W99999999 H99999999 F30:1\nFRAME\n",
+    "<svg xmlns='http://www.w3.org/2000/svg' width='1e9'/>",
+    "GIF89a" + "\xff" * 20,
+)
 SIZES = ((2, 2), (4000, 20), (20, 4000), (16, 16), (8000, 8), (1000, 2), (64, 2))
 
 
@@ -120,8 +124,16 @@ def folders(rng: random.Random, room: Room, shared: Shared) -> Case:
 @kind("datasets", 60)
 def datasets(rng: random.Random, room: Room, shared: Shared) -> Case:
     """Miniatures of the public datasets with one or two files damaged."""
-    make = rng.choice((miniatures.kitti_raw, miniatures.kitti_odometry, miniatures.seven_scenes, miniatures.euroc,
-                       miniatures.replica, miniatures.bonn))  # fmt: skip
+    make = rng.choice(
+        (
+            miniatures.kitti_raw,
+            miniatures.kitti_odometry,
+            miniatures.seven_scenes,
+            miniatures.euroc,
+            miniatures.replica,
+            miniatures.bonn,
+        )
+    )
     made = make(room.given)
     files = sorted(p for p in room.given.rglob("*") if p.is_file())
     texts = [p for p in files if p.suffix not in (".png", ".jpg")]
@@ -149,8 +161,8 @@ def sequence(room: Room, count: int = 3) -> Path:
         np.save(folder / f"depth/{t}.npy", np.full((48, 64), 2.0, np.float32))
         Image.new("L", (64, 48), 10).save(folder / f"semantic/{t}.png")
         Image.new("L", (64, 48)).save(folder / f"mask/{t}.png")
-        for name in rows:
-            rows[name].append(f"{t} {name}/{t}.{'npy' if name == 'depth' else 'png'}\n")
+        for name, lines in rows.items():
+            lines.append(f"{t} {name}/{t}.{'npy' if name == 'depth' else 'png'}\n")
     for name, lines in rows.items():
         (folder / f"{name}.txt").write_text("".join(lines))
     truth = [f"{1000 + n / 30:.6f} {0.1 * n:.3f} {0.02 * n * n:.3f} 0.0 0 0 0 1\n" for n in range(count)]

@@ -13,10 +13,32 @@ from mastd3r.config import Config, config_to_yaml, ranges
 COMMANDS = ("run", "resume", "map", "demo", "eval", "export", "view", "bench", "weights", "download", "doctor", "live")
 OPTIONS = ("--seed", "--start", "--end", "--stride", "--map-minutes", "--intrinsics", "--quality", "--kind", "--preset")
 YAML = (
-    "!!int 'x'", "!!python/object/apply:os.system ['true']", "2024-13-45", "2024-01-01", "&a [*a]", "[" * 5000,
-    "{a: " * 3000, "!!binary '###'", "!!timestamp x", "? [a]\n: b", "*nothing", "9" * 400, "1e999", ".nan", "\x00",
-    "'\\ud800'", "!!set {a}", "<<: 1", "[1, 2", "{a: 1, a: 2}", "0b2", "190:20:30", "\ufeff1", "- - - 1", "%TAG",
-)  # fmt: skip
+    "!!int 'x'",
+    "!!python/object/apply:os.system ['true']",
+    "2024-13-45",
+    "2024-01-01",
+    "&a [*a]",
+    "[" * 5000,
+    "{a: " * 3000,
+    "!!binary '###'",
+    "!!timestamp x",
+    "? [a]\n: b",
+    "*nothing",
+    "9" * 400,
+    "1e999",
+    ".nan",
+    "\x00",
+    "'\\ud800'",
+    "!!set {a}",
+    "<<: 1",
+    "[1, 2",
+    "{a: 1, a: 2}",
+    "0b2",
+    "190:20:30",
+    "\ufeff1",
+    "- - - 1",
+    "%TAG",
+)
 LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
     f"{chr(98 + n)}: &{chr(98 + n)} [{','.join(['*' + chr(97 + n)] * 9)}]\n" for n in range(9)
 )
@@ -110,10 +132,16 @@ def names(rng: random.Random, room: Room, shared: Shared) -> Case:
         ["eval", "--trajectory", path, "--format", "tum", shared.run.parent / "photos"],
         ["export", shared.run, "--to", "tum", f"--out={room.out / name}"],
         ["export", path, "--to", name, "--out", room.out],
-        ["view", path], ["resume", path], ["map", path], ["bench", path, "--data", path, "--list"],
-        ["weights", "check", path], ["weights", "download", path, "--yes"], ["weights", "path", path],
-        ["weights", "download", shared.one_image, f"--as={name}", "--yes"], ["download", name, name, "--yes"],
-    ]  # fmt: skip
+        ["view", path],
+        ["resume", path],
+        ["map", path],
+        ["bench", path, "--data", path, "--list"],
+        ["weights", "check", path],
+        ["weights", "download", path, "--yes"],
+        ["weights", "path", path],
+        ["weights", "download", shared.one_image, f"--as={name}", "--yes"],
+        ["download", name, name, "--yes"],
+    ]
     return Case(rng.choice(words))
 
 
@@ -125,27 +153,80 @@ def places_to_write(rng: random.Random, room: Room, shared: Shared) -> Case:
     other.mkdir()
     (other / "chapter.tex").write_text("years")
     out = rng.choice(
-        (taken, taken / "x", other, room.given, "/dev/null", "/dev/full", "/proc/x", "/proc/self/fd/1", "", "/", ".",
-         "~nobody/x", "~root", shared.one_image, shared.one_image / "run", other / "chapter.tex" / "x", "x\0y",
-         room.out / rng.choice(NAMES))
-    )  # fmt: skip
+        (
+            taken,
+            taken / "x",
+            other,
+            room.given,
+            "/dev/null",
+            "/dev/full",
+            "/proc/x",
+            "/proc/self/fd/1",
+            "",
+            "/",
+            ".",
+            "~nobody/x",
+            "~root",
+            shared.one_image,
+            shared.one_image / "run",
+            other / "chapter.tex" / "x",
+            "x\0y",
+            room.out / rng.choice(NAMES),
+        )
+    )
     words: list[list[str | Path]] = [
         ["run", shared.one_image, f"--out={out}", "--no-map", "--quiet"],
         ["export", shared.run, "--to", rng.choice(("tum", "kitti", "euroc", "spz", "depth")), f"--out={out}"],
-        ["export", shared.run, "--to", rng.choice(("flight", "mesh", "cloud") if not shared.quick else ("spz",)), f"--out={room.out}.{rng.choice(NAMES[:4])}"],
-        ["eval", "--trajectory", shared.run / "trajectory.txt", "--format", "tum", shared.run.parent / "photos",
-         f"--out={out}"],
+        [
+            "export",
+            shared.run,
+            "--to",
+            rng.choice(("flight", "mesh", "cloud") if not shared.quick else ("spz",)),
+            f"--out={room.out}.{rng.choice(NAMES[:4])}",
+        ],
+        [
+            "eval",
+            "--trajectory",
+            shared.run / "trajectory.txt",
+            "--format",
+            "tum",
+            shared.run.parent / "photos",
+            f"--out={out}",
+        ],
         ["bench", "local", "--data", room.given, f"--out={out}"],
         ["download", "tum", "fr1/xyz", f"--to={out}"],
-    ]  # fmt: skip
+    ]
     return Case(rng.choice(words))
 
 
 @kind("commands", 50)
 def commands(rng: random.Random, room: Room, shared: Shared) -> Case:
     """Words in any order: unknown, doubled, left out."""
-    pool = [*COMMANDS, "rum", "exprot", "--quite", "-v", "--verbose", "--out", "--to", "tum", "--set", "a=b", "--", "-", "list",
-            "--no-such", "--seed", *NUMBERS[:8], *NAMES[:8], "--out=x", str(room.given), "--yes", "@file", "--quiet"]  # fmt: skip
+    pool = [
+        *COMMANDS,
+        "rum",
+        "exprot",
+        "--quite",
+        "-v",
+        "--verbose",
+        "--out",
+        "--to",
+        "tum",
+        "--set",
+        "a=b",
+        "--",
+        "-",
+        "list",
+        "--no-such",
+        "--seed",
+        *NUMBERS[:8],
+        *NAMES[:8],
+        "--out=x",
+        str(room.given),
+        "--yes",
+        "@file",
+        "--quiet",
+    ]
     words: list[str | Path] = [rng.choice(pool) for _ in range(rng.randrange(6))]
     bad = ("demo", "doctor", "live")
     return Case([w for w in words if w not in bad] + (["run"] if words[:1] == ["doctor"] else []))

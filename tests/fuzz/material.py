@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +24,84 @@ from mastd3r.mapping.gaussians import GaussianArrays
 from mastd3r.mapping.ply import write_gaussians_ply
 
 NUMBERS = (
-    "nan", "inf", "-inf", "-1", "0", "-0.0", "1e400", "1e308", "-1e200", "1e-320", "1" * 400, "0x10", "1_000", "²",
-    "1e9", "999999999999", "-999999999999", "2147483648", "4294967297", "", " ", "x", "None", "true", "1,5", "½",
-)  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "-1",
+    "0",
+    "-0.0",
+    "1e400",
+    "1e308",
+    "-1e200",
+    "1e-320",
+    "1" * 400,
+    "0x10",
+    "1_000",
+    "²",
+    "1e9",
+    "999999999999",
+    "-999999999999",
+    "2147483648",
+    "4294967297",
+    "",
+    " ",
+    "x",
+    "None",
+    "true",
+    "1,5",
+    "½",
+)
 VALUES = (
-    None, True, -1, 0, 10**400, 1e308, float("nan"), float("inf"), "", "x", "[/x]", "\x1b[31m", "a\nb", [], [[]], {},
-    {"a": {}}, [None], ["x"] * 3, "9" * 400, [1e400], -1e-320, [["tracked", 10**10]], "../../../etc/passwd", "\ud800",
-)  # fmt: skip
+    None,
+    True,
+    -1,
+    0,
+    10**400,
+    1e308,
+    float("nan"),
+    float("inf"),
+    "",
+    "x",
+    "[/x]",
+    "\x1b[31m",
+    "a\nb",
+    [],
+    [[]],
+    {},
+    {"a": {}},
+    [None],
+    ["x"] * 3,
+    "9" * 400,
+    [1e400],
+    -1e-320,
+    [["tracked", 10**10]],
+    "../../../etc/passwd",
+    "\ud800",
+)
 NAMES = (
-    "[/x]", "[red]x[/red]", "a\x1b[2Jb", "a\nb", "tab\tx", "\r\r", "‮gpj.exe", "é" * 60, "😀", "-x", "--out", "~nobody",
-    "n" * 255, "n" * 256, "n" * 5000, "a/" * 200, os.fsdecode(b"\xff\xfe"), "%s%d{0}", "con", "a:b", "x" + chr(0x9B) + "y", " ",
-)  # fmt: skip
+    "[/x]",
+    "[red]x[/red]",
+    "a\x1b[2Jb",
+    "a\nb",
+    "tab\tx",
+    "\r\r",
+    "\u202egpj.exe",
+    "é" * 60,
+    "😀",
+    "-x",
+    "--out",
+    "~nobody",
+    "n" * 255,
+    "n" * 256,
+    "n" * 5000,
+    "a/" * 200,
+    os.fsdecode(b"\xff\xfe"),
+    "%s%d{0}",
+    "con",
+    "a:b",
+    "x" + chr(0x9B) + "y",
+    " ",
+)
 WALL, HUGE_BYTES = 4, 5 * 2**30
 
 
@@ -139,7 +206,7 @@ def nasty(rng: random.Random, path: Path, good: bytes = b"", huge: int = HUGE_BY
     """Put something at ``path`` that is not what belongs there."""
     kinds: tuple[Callable[[], object], ...] = (
         lambda: os.mkfifo(path),
-        lambda: path.mkdir(),
+        path.mkdir,
         lambda: path.symlink_to("nowhere"),
         lambda: path.symlink_to(path.name),
         lambda: path.symlink_to("/dev/zero"),
@@ -147,7 +214,7 @@ def nasty(rng: random.Random, path: Path, good: bytes = b"", huge: int = HUGE_BY
         lambda: path.write_bytes(rng.randbytes(rng.choice((1, 100, 5000)))),
         lambda: path.write_bytes(b"\0" * 5000),
         lambda: sparse(path, size=huge),
-        lambda: _socket(path),
+        partial(_socket, path),
     )
     if path.is_symlink() or path.exists():
         path.unlink()

@@ -18,6 +18,8 @@ def dispatch(words: list[str]) -> int:
     shown = _log_level(args)
     terminal = RichHandler(shown, console=console, show_path=False, show_time=False)
     logging.basicConfig(level=shown, format="%(message)s", handlers=[terminal], force=True)
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").setLevel(logging.WARNING if args.verbose else logging.CRITICAL)  # for developers
     logging.getLogger("mastd3r").setLevel(logging.INFO)  # for run.log; the terminal's own level stays
     args.words = ["mastd3r", *words]
     code: int = args.act(args, console)
