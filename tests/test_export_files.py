@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
 from mastd3r.export.point_cloud import read_cloud, write_cloud
-from mastd3r.reading.ply import read_vertices
 from mastd3r.export.trajectory_files import read_tum, write_tum
+from mastd3r.reading.ply import read_vertices
 from mastd3r.types import StaticCloud, Trajectory
 
 
