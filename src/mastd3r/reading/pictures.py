@@ -47,8 +47,8 @@ def check_pixels(size: tuple[int, int], where: str) -> None:
 def decoded(data: bytes, path: Path, mode: int) -> NDArray[Any]:
     """The image in the bytes of a file, as OpenCV's ``mode`` says. Raises InputError."""
     try:
-        with opened(io.BytesIO(data)):
-            pass
+        with opened(io.BytesIO(data)) as whole:
+            whole.load()  # OpenCV would speak to the terminal about what is wrong
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except (*BROKEN, cv2.error):
         image = None
