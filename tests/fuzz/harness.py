@@ -22,7 +22,8 @@ from typing import Any
 from fuzz.case import KINDS, Case, Room
 from fuzz.material import Shared
 
-LONGEST_S, KILLED_S = 10.0, 60.0  # a command may work so long; one that is not done by then hangs
+LONGEST_S = 10.0  # a command may work so long
+BLOCKED_S, KILLED_S = 40.0, 600.0  # one that does nothing for so long hangs, whatever else the machine does
 MOST_BYTES = 3 * 2**29  # 1.5 GiB
 ROOM_BYTES = 5 * 2**29  # of address space beside what the interpreter has mapped already
 HASHED_BYTES = 2**22  # of a file; larger ones are sparse
@@ -69,23 +70,33 @@ def _run(case: Case, room: Room, outcome: Outcome) -> None:
     pid = os.fork()
     if not pid:
         _child(case, room)
-    status = None
+    status, worked_s, last = None, 0.0, began
     while status is None:
         done, ended, usage = os.wait4(pid, os.WNOHANG)
         if done:
             status = ended
-        elif time.monotonic() - began > KILLED_S:
+        elif (now := _worked_s(pid)) > worked_s:
+            worked_s, last = now, time.monotonic()
+        elif time.monotonic() - last > BLOCKED_S or time.monotonic() - began > KILLED_S:
             os.killpg(pid, signal.SIGKILL)
             _, _, usage = os.wait4(pid, 0)
             break
-        else:
-            time.sleep(0.004)
+        time.sleep(0.004)
     outcome.wall_s = time.monotonic() - began
     outcome.cpu_s = usage.ru_utime + usage.ru_stime
     outcome.peak_mib = usage.ru_maxrss / 1024
     outcome.code = None if status is None else os.waitstatus_to_exitcode(status)
     outcome.out, outcome.err = _text(room.path / "stdout"), _text(room.path / "stderr")
     outcome.log = "".join(_text(p) for p in sorted((room.path / "tmp").glob("mastd3r-*.log")))
+
+
+def _worked_s(pid: int) -> float:
+    """CPU seconds of a process so far."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def _text(path: Path) -> str:
@@ -101,6 +112,7 @@ def _child(case: Case, room: Room) -> None:
         mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (mapped + ROOM_BYTES,) * 2)
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        resource.setrlimit(resource.RLIMIT_CPU, (int(3 * LONGEST_S),) * 2)
         os.chdir(room.path / "cwd")
         home = str(room.path / "home")
         os.environ |= {"TMPDIR": str(room.path / "tmp"), "MASTD3R_HOME": home, "COLUMNS": "4000", "no_proxy": "*"}
@@ -152,13 +164,13 @@ def _judge(outcome: Outcome, before: dict[str, Any], after: dict[str, Any], runn
     shown = [c for c in outcome.out + outcome.err if not (c.isprintable() or c == "\n")]
     found = {
         "traceback": outcome.code in (1, 99) or "Traceback (most recent call last)" in outcome.err + outcome.out,
-        "hang": outcome.code is None or outcome.cpu_s > LONGEST_S,
+        "hang": outcome.code is None or outcome.code == -signal.SIGXCPU or outcome.cpu_s > LONGEST_S,
         "running": bool(running),
         "lines": bool(refused and (len(ours) != 1 or lines[-1:] != ours or rest)),
         "control": bool(shown),
         "memory": outcome.peak_mib * 2**20 > MOST_BYTES or "out of memory" in outcome.err,
         "changed": after != before,
-        "code": outcome.code not in (None, 0, 1, 2, 99, 130),
+        "code": outcome.code not in (None, 0, 1, 2, 99, 130, -signal.SIGXCPU),
     }
     outcome.faults = [name for name in FAULTS if found[name]]
 

@@ -241,7 +241,7 @@ class VideoSource:
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first real video stream. Raises InputError."""
     try:
-        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY)
+        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, metadata_errors="replace")
     except av.FFmpegError as e:
         raise InputError(f"{path}: {_why_not(path)}") from e
     with container:
