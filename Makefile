@@ -2,11 +2,12 @@
 # make test    set up, then every check: ruff, mypy, pytest
 
 PYTHON ?= python3
+SEED ?= 1
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.stamp
 
-.PHONY: help setup demo test lint format bench clean
+.PHONY: help setup demo test lint format bench fuzz docs clean
 
 help:
 	@echo "make setup   create $(VENV) and install the package with its test tools"
@@ -15,6 +16,8 @@ help:
 	@echo "make lint    ruff and mypy only"
 	@echo "make format  rewrite the code in the house style"
 	@echo "make bench   speed of the splat rasteriser on this machine"
+	@echo "make fuzz    a thousand bad inputs, counts by kind into runs/fuzz.json (SEED=n for others)"
+	@echo "make docs    the documentation as a site, into site/"
 	@echo "make clean   remove $(VENV) and caches; runs/ stays"
 
 setup: $(STAMP)
@@ -44,6 +47,14 @@ bench: setup
 	@mkdir -p runs
 	$(BIN)/python benchmarks/bench_rasteriser.py --out runs/bench_rasteriser.json
 
+fuzz: setup
+	@mkdir -p runs
+	PYTHONPATH=tests $(BIN)/python -m fuzz --cases 1000 --seed $(SEED) --out runs/fuzz.json
+
+docs: setup
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[docs]'
+	$(BIN)/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find src tests benchmarks docs -name __pycache__ -type d -prune -exec rm -rf {} +

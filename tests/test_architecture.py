@@ -29,6 +29,7 @@ MAX_FILE_LINES, MAX_FUNCTION_LINES, MAX_TRACK_LINES, MAX_TOP_FILES = 400, 60, 40
 # From the bottom up. A folder or top-level file sees what lies in rows above its own here, and nothing of its own row.
 ROWS: tuple[tuple[str, ...], ...] = (
     ("errors", "concurrency", "progress"),
+    ("reading",),
     ("registry", "geometry", "download"),
     ("camera", "config"),
     ("types",),

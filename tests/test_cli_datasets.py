@@ -33,9 +33,7 @@ def refused(capfd: pytest.CaptureFixture[str], code: int, out: Path, *words: str
         ("bonn", "rgb", ["rgb.txt", "expected"]),
         ("kitti-raw", "image_02/data/0000000001.png", ["expected 4 images, got 3", "missing is 1"]),
         ("kitti-odometry", "calib.txt", ["calib.txt", "got no such file"]),
-        ("7scenes", "frame-000001.pose.txt", ["frame-000001.pose.txt", "expected a pose"]),
         ("euroc", "mav0/cam0/sensor.yaml", ["sensor.yaml", "expected the camera's calibration"]),
-        ("replica", "traj.txt", ["traj.txt", "expected a text file"]),
     ],
 )
 def test_a_dataset_with_something_lost(

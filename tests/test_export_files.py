@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError
-from mastd3r.export.point_cloud import read_cloud, read_vertices, write_cloud
+from mastd3r.export.point_cloud import read_cloud, write_cloud
 from mastd3r.export.trajectory_files import read_tum, write_tum
+from mastd3r.reading.ply import read_vertices
 from mastd3r.types import StaticCloud, Trajectory
 
 
@@ -92,7 +93,7 @@ def test_broken_clouds_are_named(tmp_path: Path) -> None:
     write_cloud(path, some_cloud(10))
     whole = path.read_bytes()
     path.write_bytes(whole[:-5])
-    with pytest.raises(InputError, match="bytes of vertices"):
+    with pytest.raises(InputError, match="expected 10 vertices of 27 bytes, got 265"):
         read_vertices(path)
     path.write_bytes(whole.replace(b"float spacing", b"float unknown"))
     with pytest.raises(InputError, match="spacing"):

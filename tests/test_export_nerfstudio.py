@@ -16,7 +16,7 @@ from made_runs import NAMES, made_run, without_distortion
 from mastd3r.camera.opencv_lens import OpenCvLens
 from mastd3r.camera.pinhole import Camera
 from mastd3r.errors import InputError
-from mastd3r.export.point_cloud import read_vertices
+from mastd3r.reading.ply import read_vertices
 
 Array = NDArray[Any]
 BENT = Camera(90.0, 90.0, 47.0, 36.5, 96, 72, k1=-0.08, k2=0.01)

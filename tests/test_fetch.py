@@ -258,7 +258,7 @@ def test_local_files_and_file_urls_are_copied(tmp_path: Path) -> None:
         assert got.path.read_bytes() == DATA and told[SIZE] == SIZE and max(told) == SIZE
     with pytest.raises(InputError, match="expected sha256 0"):
         fetch(source, tmp_path / "wrong", Wanted("0" * 64))
-    with pytest.raises(InputError, match="expected a file, got No such file"):
+    with pytest.raises(InputError, match="expected a file, got no such file"):
         fetch(tmp_path / "absent", tmp_path / "wrong")
     with pytest.raises(InputError, match="expected 5 bytes, got 3000000"):
         fetch(source, tmp_path / "wrong", Wanted(size_bytes=5))

@@ -253,7 +253,7 @@ def test_local_files_and_folders_are_copied_and_held_to_the_release(server: File
     with pytest.raises(InputError, match="expected sha256"):
         download(str(stick / PTH), yes)
     (stick / DINO / "config.json").write_bytes(CONFIG)
-    with pytest.raises(InputError, match="expected a file, got No such file"):
+    with pytest.raises(InputError, match="expected a file, got no such file"):
         download(str(stick / DINO), yes)
     (stick / DINO / "model.safetensors").write_bytes(SMALL)
     assert download(str(stick / DINO), yes) == folder_of(DINO) and installed(DINO)

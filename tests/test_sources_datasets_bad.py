@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -56,11 +57,6 @@ DAMAGE = {
         "kitti-raw", unlink("image_02/data/0000000002.png"),
         r"expected 4 images, got 3; .* 2",
     ),
-    "raw: a packet is missing": ("kitti-raw", unlink("oxts/data/0000000003.txt"), r"expected 4 packets, got 3; .* 3"),
-    "raw: a packet is cut": (
-        "kitti-raw", write("oxts/data/0000000001.txt", "49.0 8.4 116"),
-        r"0000000001\.txt line 1: expected lat lon",
-    ),
     "raw: a time is none": (
         "kitti-raw", write("image_02/timestamps.txt", "noon\n"),
         r"timestamps\.txt line 1: expected 'YYYY",
@@ -77,12 +73,6 @@ DAMAGE = {
         "kitti-raw", write("../calib_imu_to_velo.txt", "R: 1 0 0 0 1 0 0 0 2\nT: 0 0 0\n"),
         "expected a rotation",
     ),
-    "odometry: poses are cut": ("kitti-odometry", cut("../../poses/03.txt", 1), r"03\.txt: expected 4 poses .* got 3"),
-    "odometry: a pose is cut": (
-        "kitti-odometry", write("../../poses/03.txt", "1 0 0 0 1\n"),
-        r"03\.txt line 1: expected a \(3, 4\) matrix \(12 numbers\), got 5",
-    ),
-    "odometry: times are cut": ("kitti-odometry", cut("times.txt", 1), r"expected 3 poses .* got 4"),
     "odometry: an image is missing": (
         "kitti-odometry", unlink("image_2/000001.png"),
         r"expected 4 images, got 3; .* 1",
@@ -94,18 +84,6 @@ DAMAGE = {
     "odometry: calibration is cut": (
         "kitti-odometry", swap("calib.txt", "P2: 721.5377", "P2: "),
         r"line 3: expected 12 numbers after P2",
-    ),
-    "7scenes: a pose is missing": (
-        "7scenes", unlink("frame-000001.pose.txt"),
-        r"frame-000001\.pose\.txt: expected a pose",
-    ),
-    "7scenes: a pose is cut": (
-        "7scenes", cut("frame-000002.pose.txt", 1),
-        r"frame-000002\.pose\.txt: expected 4 lines of 4 numbers, got 3",
-    ),
-    "7scenes: a pose is words": (
-        "7scenes", write("frame-000000.pose.txt", "lost\n"),
-        r"line 1: expected a row of a \(4, 4\) matrix",
     ),
     "euroc: no sensor.yaml": (
         "euroc", unlink("mav0/cam0/sensor.yaml"),
@@ -128,12 +106,6 @@ DAMAGE = {
         "euroc", unlink("mav0/cam0/data/1403636579813555584.png"),
         r"1403636579813555584\.png: expected an image",
     ),
-    "euroc: a pose is cut": (
-        "euroc", write("mav0/state_groundtruth_estimate0/data.csv", "#h\n1403636579763555584,1,2\n"),
-        r"data\.csv line 2: expected nanoseconds, position",
-    ),
-    "replica: poses are cut": ("replica", cut("traj.txt", 1), r"traj\.txt: expected 3 poses, one an image, got 2"),
-    "replica: images are cut": ("replica", unlink("results/frame000002.jpg"), r"expected 3 images, got 2; .* 2"),
     "replica: no camera": (
         "replica", unlink("../cam_params.json"),
         r"expected cam_params\.json in the folder or beside it",
@@ -142,10 +114,41 @@ DAMAGE = {
         "replica", swap("../cam_params.json", '"scale"', '"skale"'),
         "expected 'camera' with w, h, .*'scale'",
     ),
+}  # fmt: skip
+DAMAGED_TRUTH = {
+    "raw: a packet is missing": ("kitti-raw", unlink("oxts/data/0000000003.txt"), r"expected 4 packets, got 3; .* 3"),
+    "raw: a packet is cut": (
+        "kitti-raw", write("oxts/data/0000000001.txt", "49.0 8.4 116"),
+        r"0000000001\.txt line 1: expected lat lon",
+    ),
+    "odometry: poses are cut": ("kitti-odometry", cut("../../poses/03.txt", 1), r"03\.txt: expected 4 poses .* got 3"),
+    "odometry: a pose is cut": (
+        "kitti-odometry", write("../../poses/03.txt", "1 0 0 0 1\n"),
+        r"03\.txt line 1: expected a \(3, 4\) matrix \(12 numbers\), got 5",
+    ),
+    "7scenes: a pose is missing": (
+        "7scenes", unlink("frame-000001.pose.txt"),
+        r"frame-000001\.pose\.txt: expected a pose",
+    ),
+    "7scenes: a pose is cut": (
+        "7scenes", cut("frame-000002.pose.txt", 1),
+        r"frame-000002\.pose\.txt: expected 4 lines of 4 numbers, got 3",
+    ),
+    "7scenes: a pose is words": (
+        "7scenes", write("frame-000000.pose.txt", "lost\n"),
+        r"line 1: expected a row of a \(4, 4\) matrix",
+    ),
+    "euroc: a pose is cut": (
+        "euroc", write("mav0/state_groundtruth_estimate0/data.csv", "#h\n1403636579763555584,1,2\n"),
+        r"data\.csv line 2: expected nanoseconds, position",
+    ),
+    "replica: poses are cut": ("replica", cut("traj.txt", 1), r"traj\.txt: expected 3 poses, one an image, got 2"),
     "replica: no matrix": (
         "replica", write("traj.txt", "1 2 3\n"),
         r"traj\.txt line 1: expected a \(4, 4\) matrix \(16 numbers\), got 3",
     ),
+    "odometry: times are cut": ("kitti-odometry", cut("times.txt", 1), r"expected 3 poses .* got 4"),
+    "replica: images are cut": ("replica", unlink("results/frame000002.jpg"), r"expected 2 poses, one an image, got 3"),
 }  # fmt: skip
 
 
@@ -156,6 +159,18 @@ def test_damage_is_refused_with_what_was_expected(tmp_path: Path, case: str) -> 
     damage(made.folder)
     with pytest.raises(InputError, match=message):
         open_source(made.folder, AUTO, want_depth=True)
+
+
+@pytest.mark.parametrize("case", DAMAGED_TRUTH)
+def test_damaged_truth_stops_nobody_and_is_told_at_once(tmp_path: Path, case: str) -> None:
+    kind, damage, message = DAMAGED_TRUTH[case]
+    made = MAKERS[kind](tmp_path)
+    damage(made.folder)
+    source = open_source(made.folder, AUTO, want_depth=True)
+    assert any(re.search(f"truth is left out: .*{message}", note) for note in source.notes)
+    truth = source.truth()
+    assert truth is None or len(truth.timestamps_s) == 0
+    assert len(list(source.frames())) == source.length
 
 
 @pytest.mark.parametrize("kind", MAKERS)

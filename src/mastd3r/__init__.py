@@ -9,7 +9,9 @@
 Names are loaded when they are first used, so that importing the package costs nothing.
 """
 
+import os
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -67,6 +69,31 @@ _HOME = {
     "reconstruct": "pipeline",
     "run_live": "live.run",
 }
+
+
+def _let_kernels_be_kept() -> None:
+    """Numba compiles nothing where it can keep nothing: where the installation is read-only, and the user has no home.
+
+    They are kept in the folder for temporary files then, if that is the user's alone.
+    """
+    package, home = Path(__file__).parent, Path(os.path.expanduser("~"))
+    beside = package / "__pycache__" if (package / "__pycache__").is_dir() else package
+    there = home / ".cache" if (home / ".cache").is_dir() else home
+    if "NUMBA_CACHE_DIR" in os.environ or os.access(beside, os.W_OK) or os.access(there, os.W_OK):
+        return
+    import tempfile
+
+    try:
+        folder = Path(tempfile.gettempdir()) / f"mastd3r-kernels-{getattr(os, 'getuid', int)()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        info = folder.lstat()
+        mine = not hasattr(os, "getuid") or (info.st_uid == os.getuid() and info.st_mode & 0o077 == 0)
+        os.environ["NUMBA_CACHE_DIR"] = str(folder if mine and not folder.is_symlink() else tempfile.mkdtemp())
+    except OSError:  # nothing can be written anywhere: whoever compiles says so
+        return
+
+
+_let_kernels_be_kept()
 
 
 def __getattr__(name: str) -> Any:

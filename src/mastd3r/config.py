@@ -19,6 +19,8 @@ import yaml
 
 from .dynamics.config import OLD_NAMES, DynamicsConfig
 from .errors import ConfigError
+from .reading.files import short
+from .reading.yaml_text import yaml_file, yaml_value
 from .registry import (
     ALIGNMENT,
     FEATURES,
@@ -37,7 +39,6 @@ from .registry import (
 )
 
 log = logging.getLogger(__name__)
-SHOWN = 60  # characters of a wrong value that are repeated
 
 PointmapKind = Annotated[str, POINTMAPS]  # names of a registry: also those that were registered from outside
 FeaturesKind = Annotated[str, FEATURES]
@@ -222,24 +223,26 @@ def preset(name: str) -> Config:
 
 def config_from_yaml(path: Path, base: Config | None = None) -> Config:
     """Read a YAML file of overrides of ``base`` (the defaults). Raises ConfigError."""
-    try:
-        data = yaml.safe_load(path.read_text()) or {}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as e:
-        raise ConfigError(f"config file {path}: expected readable YAML, got {_one_line(e)}") from e
-    if not isinstance(data, dict):
-        raise ConfigError(f"config file {path}: expected key: value pairs, got {type(data).__name__}")
-    return config_from_dict(data, base)
+    return _config_of(yaml_file(path, "config file", ConfigError), f"config file {path}", base)
+
+
+def config_from_text(text: str, where: str) -> Config:
+    """A whole config.yaml that was read before; ``where`` for messages. Raises ConfigError."""
+    return _config_of(yaml_value(text, where, ConfigError), where, None)
+
+
+def _config_of(data: Any, where: str, base: Config | None) -> Config:
+    if data is not None and not isinstance(data, dict):
+        raise ConfigError(f"{where}: expected key: value pairs, got {type(data).__name__}")
+    return config_from_dict(data or {}, base)
 
 
 def with_override(config: Config, dotted: str) -> Config:
     """Apply one ``section.key=value``; the value is read as YAML. Raises ConfigError."""
     key, eq, text = dotted.partition("=")
     if not eq:
-        raise ConfigError(f"--set: expected section.key=value, got {dotted!r}")
-    try:
-        nested: Any = yaml.safe_load(text)
-    except (yaml.YAMLError, ValueError, RecursionError) as e:
-        raise ConfigError(f"--set {key}: expected a YAML value, got {_shortly(text)} ({_one_line(e)})") from e
+        raise ConfigError(f"--set: expected section.key=value, got {short(repr(dotted))}")
+    nested: Any = yaml_value(text, f"--set {short(key)}", ConfigError, "a YAML value")
     for part in reversed(key.split(".")):
         nested = {part: nested}
     return _merged(config, nested)
@@ -268,10 +271,6 @@ def ranges(section: Any = None, where: str = "") -> dict[str, str]:
 def config_to_yaml(config: Config) -> str:
     """The whole effective configuration as YAML text."""
     return yaml.safe_dump(_plain(dataclasses.asdict(config)), sort_keys=False)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
 
 
 def _plain(value: Any) -> Any:
@@ -304,7 +303,7 @@ def _with_new_names(data: Any, where: str = "") -> Any:
         for section in sections:
             place = place.setdefault(section, {})
             if not isinstance(place, dict):
-                raise ConfigError(f"config {where}{section}: expected key: value pairs, got {place!r}")
+                raise ConfigError(f"config {where}{section}: expected key: value pairs, got {short(repr(place))}")
         if last in place:
             raise ConfigError(f"config: expected {RENAMED[old]} or its old name {old}, got both")
         place[last] = value
@@ -319,7 +318,9 @@ def _say_renamed(old: str) -> None:
 
 def _merge(obj: Any, data: Any, where: str) -> Any:
     if not isinstance(data, dict):
-        raise ConfigError(f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {data!r}")
+        raise ConfigError(
+            f"config {where.rstrip('.') or 'top level'}: expected key: value pairs, got {short(repr(data))}"
+        )
     hints = typing.get_type_hints(type(obj), include_extras=True)
     names = [f.name for f in fields(obj)]
     changes: dict[str, Any] = {}
@@ -327,7 +328,7 @@ def _merge(obj: Any, data: Any, where: str) -> Any:
         if key not in names:
             near = difflib.get_close_matches(str(key), names, n=1)
             hint = f"; perhaps you meant {where}{near[0]}" if near else f"; known: {', '.join(names)}"
-            raise ConfigError(f"config: unknown key {where}{key}{hint}")
+            raise ConfigError(f"config: unknown key {where}{short(str(key))}{hint}")
         current = getattr(obj, key)
         if is_dataclass(current):
             changes[key] = _merge(current, value, f"{where}{key}.")
@@ -347,7 +348,7 @@ def _chosen(value: Any, hint: Any, where: str) -> Any:
         return rule.check(value, where=f"config {where}")
     options = typing.get_args(hint)
     if value not in options:
-        raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {value!r}")
+        raise ConfigError(f"config {where}: expected one of {', '.join(map(str, options))}, got {short(repr(value))}")
     return value
 
 
@@ -361,12 +362,12 @@ def _checked(value: Any, hint: Any, where: str) -> Any:
         return _checked(value, next(a for a in typing.get_args(hint) if a is not type(None)), where)
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise ConfigError(f"config {where}: expected a list, got {value!r}")
+            raise ConfigError(f"config {where}: expected a list, got {short(repr(value))}")
         return tuple(_checked(v, typing.get_args(hint)[0], where) for v in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return _as_float(value, where)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
-        raise ConfigError(f"config {where}: expected {hint.__name__}, got {_shortly(value)}")
+        raise ConfigError(f"config {where}: expected {hint.__name__}, got {short(repr(value))}")
     return value
 
 
@@ -375,8 +376,3 @@ def _as_float(value: int, where: str) -> float:
         return float(value)
     except OverflowError as e:
         raise ConfigError(f"config {where}: expected a number, got one of {len(str(abs(value))[:20])}+ digits") from e
-
-
-def _shortly(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}…"

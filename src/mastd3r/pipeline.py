@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,12 +21,15 @@ from .evaluation.evaluate import evaluate_trajectory as score
 from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
 from .export.read_run import read_json
 from .export.run_folder import RunFolder
+from .export.run_record import checked_record
 from .export.trajectory_files import read_trajectory
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
 from .offline.tracked import MapMaterial
 from .parts import with_dataset_lens
 from .progress import Reporter, Silent
+from .reading.files import is_file, resolved, user_path, whole_text
+from .reading.yaml_text import MOST_YAML_BYTES
 from .slam import Slam
 from .sources import open_source
 from .types import Frame, Source
@@ -36,7 +40,7 @@ log = logging.getLogger(__name__)
 
 def load(path: str | Path) -> Reconstruction:
     """A run folder that was written earlier, complete or not. Raises InputError where it is none."""
-    return Reconstruction(Path(path).expanduser())
+    return Reconstruction(user_path(path))
 
 
 @one_blas_thread()
@@ -63,10 +67,10 @@ def reconstruct(
         return _of_images(source, config, _Wanted(out, overwrite, command), reporter)
     read = {"path": _absolute(source), "maps": None if maps is None else _absolute(maps)}
     slam, notes = _slam_of(source, config, maps)
-    stopped = None if out is None or overwrite else _stopped_as(Path(out).expanduser(), slam, read)
+    stopped = None if out is None or overwrite else _stopped_as(user_path(out, "out"), slam, read)
     if stopped is not None:
         return _go_on(slam, stopped, reporter)
-    inputs = [Path(p).expanduser() for p in (source, maps) if p is not None]
+    inputs = [user_path(p) for p in (source, maps) if p is not None]
     folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
     with folder:
         folder.update(source=read)
@@ -85,15 +89,15 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
     The trajectory is that of a run that was never stopped. Raises InputError for a folder that holds no such run, or
     whose source is gone; otherwise as ``reconstruct``.
     """
-    path = Path(run).expanduser()
+    path = user_path(run)
     stopped = stopped_run(path)
     if stopped is None:
         raise InputError(f"{path}: expected a run that was stopped, got {_what_is_in(path)}")
-    record = read_json(stopped / "run.json")
+    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
     if record.get("live"):
         raise InputError(f"{stopped}: expected a run of files, got a live one; mastd3r finish goes on with its frames")
     read = record.get("source") or {}
-    if not (stopped / "config.yaml").is_file() or not read.get("path"):
+    if not os.path.lexists(stopped / "config.yaml") or not read.get("path"):
         raise InputError(f"{stopped}: expected config.yaml and source.path in run.json, got a run stopped before them")
     slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"))
     return _go_on(slam, stopped, reporter or Silent())
@@ -131,7 +135,7 @@ def _what_is_in(path: Path) -> str:
 
 
 def _absolute(path: str | Path) -> str:
-    return str(Path(path).expanduser().resolve())
+    return str(resolved(user_path(path)))
 
 
 def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
@@ -139,16 +143,16 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
     stopped = stopped_run(out) if out.is_dir() else None
     if stopped is None or not (stopped / CHECKPOINT).is_dir():
         return None
-    record = read_json(stopped / "run.json")
+    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
     was = record.get("source") or {}
     config = stopped / "config.yaml"
-    same = config.is_file() and config.read_text(encoding="utf-8") == config_to_yaml(slam.config)
+    same = is_file(config) and whole_text(config, "YAML", most=MOST_YAML_BYTES) == config_to_yaml(slam.config)
     return stopped if same and all(was.get(k) == v for k, v in read.items()) else None
 
 
 def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
     """A stopped run, from its last good checkpoint."""
-    record = read_json(stopped / "run.json")
+    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
     ended_live = bool(record.get("live")) and record.get("status") == "complete"
     with RunFolder.going_on(stopped, record) as folder:
         if record.get("live"):
@@ -181,7 +185,7 @@ def evaluate_trajectory(path: str | Path, kind: str, sequence: str | Path) -> di
     """
     source = open_source(sequence, Config().source)
     times_s = np.array([f.timestamp_s for f in source.frames()])
-    found = score(read_trajectory(Path(path), kind, times_s), source.truth(), times_s).metrics
+    found = score(read_trajectory(user_path(path), kind, times_s), source.truth(), times_s).metrics
     for note in source.notes:
         log.warning(note)
     return found
@@ -205,7 +209,7 @@ def _slam_of(path: str | Path, config: Config, maps: str | Path | None) -> tuple
         config.source,
         want_depth=config.pointmaps == "depth",
         want_semantic=config.semantics in ("auto", "maps"),
-        semantic_dir=None if maps is None else Path(maps),
+        semantic_dir=None if maps is None else user_path(maps),
     )
     config, notes = with_dataset_lens(config, source)
     return Slam(config, source.size, source=source), notes
@@ -225,7 +229,7 @@ def _folder(wanted: _Wanted, inputs: list[Path]) -> tuple[RunFolder, tempfile.Te
     if out is None:
         temporary = tempfile.TemporaryDirectory(prefix="mastd3r-run-", ignore_cleanup_errors=True)
         out = temporary.name
-    path = Path(out).expanduser()
+    path = user_path(out, "out")
     return RunFolder(path, list(wanted.command), inputs, overwrite=wanted.overwrite), temporary
 
 

@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import Annotated, Any
 
 from .errors import ConfigError
+from .reading.files import short
 
 AUTO = "auto"
 LARGEST = 10**9  # of a number that has no other bound
@@ -117,7 +118,9 @@ class Registry:
             return name
         near = difflib.get_close_matches(str(name), self.choices, n=1)
         hint = f"; perhaps you meant {near[0]}" if near else ""
-        raise ConfigError(f"{where or self.option}: expected one of {', '.join(self.choices)}, got {name!r}{hint}")
+        raise ConfigError(
+            f"{where or self.option}: expected one of {', '.join(self.choices)}, got {short(repr(name))}{hint}"
+        )
 
     def create(self, name: str, *given: Any, **options: Any) -> Any:
         """Build the part of that name. Raises ConfigError for an unknown one, and what building raises."""

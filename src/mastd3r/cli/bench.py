@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import InputError
+from .options import path
+from .screen import screen
 
 if TYPE_CHECKING:
     from ..experiments.store import Store
@@ -21,9 +23,9 @@ def bench_parser(p: argparse.ArgumentParser) -> None:
     """Fill in the parser of ``bench``."""
     p.add_argument("suite", help="tum-dynamic, bonn, kitti, correction, loss, local, or a YAML file of your own")
     p.add_argument(
-        "--data", type=Path, default=Path("datasets"), help="folder that holds the sequences (default datasets)"
+        "--data", type=path, default=Path("datasets"), help="folder that holds the sequences (default datasets)"
     )
-    p.add_argument("--out", type=Path, help="where results go and stay (default runs/bench-SUITE)")
+    p.add_argument("--out", type=path, help="where results go and stay (default runs/bench-SUITE)")
     p.add_argument("--jobs", type=int, metavar="N", help="runs at once, each on its share of the cores (default 1)")
     p.add_argument("--memory-mib", type=float, metavar="M", help="for all of them (default: 80 %% of the machine's)")
     p.add_argument("--seeds", type=int, nargs="+", metavar="N", help="instead of the suite's")
@@ -52,7 +54,7 @@ def _bench(args: argparse.Namespace, console: Console) -> int:
     _run(todo, len(chosen), folders, store, allowed, console)
     written = _write(suite, sequences, folders, args, store)
     _say_what_is_missing(written, console)
-    Console().print(f"wrote {store.out / 'table.md'} and {store.out / 'table.html'}", soft_wrap=True, markup=False)
+    screen().print(f"wrote {store.out / 'table.md'} and {store.out / 'table.html'}", soft_wrap=True, markup=False)
     if not folders:
         raise InputError(f"--data {args.data}: expected sequences of {suite.name}, got none; see {store.out}/table.md")
     return 0
@@ -70,7 +72,7 @@ def _show_list(chosen: list[Entry], folders: dict[str, Path], store: Store) -> i
         state = record["status"] if record else "to run" if entry.sequence.name in folders else "sequence missing"
         took = f"{record['wall_s']:.0f}" if record else ""
         table.add_row(str(number), entry.label, state, f"{needs[entry.id]:.0f}", took)
-    Console().print(table)
+    screen().print(table)
     return 0
 
 

@@ -18,6 +18,7 @@ from rich.text import Text
 from ..config import Config, config_to_yaml, ranges
 from ..errors import ConfigError
 from .options import checked_minutes, config_from_args
+from .screen import screen
 from .signals import end_this_command
 
 if TYPE_CHECKING:
@@ -52,7 +53,7 @@ def train_map(args: argparse.Namespace, console: Console) -> int:
     run = load(args.run)
     reporter = reporter_of(args, console)
     metrics = run.train_map(minutes, args.quality, source=args.source, reporter=reporter)
-    Console().print(_table(metrics))
+    screen().print(_table(metrics))
     _open(run.path)
     return 0
 
@@ -92,14 +93,14 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
 def show(result: Reconstruction) -> None:
     """What came of a run."""
     if result.observability.get("said"):
-        Console().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
-    Console().print(_table(result.metrics))
+        screen().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
+    screen().print(_table(result.metrics))
     _open(result.path)
 
 
 def _open(run: Path) -> None:
     """Where to look now."""
-    Console().print("Open", Text(str(run / "report.html"), "bold"), soft_wrap=True)
+    screen().print("Open", Text(str(run / "report.html"), "bold"), soft_wrap=True)
 
 
 def _table(metrics: dict[str, Any]) -> Table:
@@ -139,13 +140,13 @@ def evaluate_run(args: argparse.Namespace, console: Console) -> int:
             got = "--format or --out without it" if args.format or args.out else f"{len(args.paths)} path(s)"
             raise ConfigError(f"eval: expected RUN SEQUENCE, or --trajectory FILE --format KIND SEQUENCE, got {got}")
         run, sequence = args.paths
-        Console().print(_table(load(run).evaluate(sequence)))
+        screen().print(_table(load(run).evaluate(sequence)))
         return 0
     if len(args.paths) != 1 or args.format is None:
         got = f"{len(args.paths)} paths and --format {args.format}"
         raise ConfigError(f"eval --trajectory: expected --format tum, kitti or euroc and one SEQUENCE, got {got}")
     metrics = evaluate_trajectory(args.trajectory, args.format, args.paths[0])
-    Console().print(_table(metrics))
+    screen().print(_table(metrics))
     if args.out is not None:
         write_json(args.out, metrics)
     return 0
@@ -158,7 +159,7 @@ def export(args: argparse.Namespace, console: Console) -> int:
     reporter = reporter_of(args, console)
     options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
     written = load(args.run).export(args.to, args.out, reporter=reporter, **options)
-    Console().print(f"wrote {written}", soft_wrap=True, markup=False)
+    screen().print(f"wrote {written}", soft_wrap=True, markup=False)
     return 0
 
 
@@ -172,15 +173,15 @@ def doctor(args: argparse.Namespace, console: Console) -> int:
     table = Table(show_header=False)
     for key, value in machine_info().items():
         table.add_row(key, Text(str(value)))
-    Console().print(table)
+    screen().print(table)
     for registry in REGISTRIES:
         parts = "; ".join(f"{e.name} ({e.summary})" for e in registry.entries())
-        Console().print(f"{registry.option}: {parts}", highlight=False, markup=False)
+        screen().print(f"{registry.option}: {parts}", highlight=False, markup=False)
     kind, why = chosen_pointmaps(Config())
     device, reason = map_device("auto")
-    Console().print(f"pointmaps auto: {kind} ({why}) · map auto: {device} ({reason})")
-    Console().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
-    Console().print("[dim]numbers may be:[/dim]")
+    screen().print(f"pointmaps auto: {kind} ({why}) · map auto: {device} ({reason})")
+    screen().print("[dim]effective defaults:[/dim]\n" + config_to_yaml(Config()))
+    screen().print("[dim]numbers may be:[/dim]")
     for key, words in ranges().items():
-        Console().print(f"{key}: {words}", highlight=False, markup=False)
+        screen().print(f"{key}: {words}", highlight=False, markup=False)
     return 0

@@ -5,19 +5,21 @@ from __future__ import annotations
 import argparse
 import logging
 
-from rich.console import Console
 from rich.logging import RichHandler
 
 from .parser import parser
+from .screen import screen
 
 
 def dispatch(words: list[str]) -> int:
     """Parse and run one command; returns the exit code."""
     args = parser().parse_args(words)
-    console = Console(stderr=True)
+    console = screen(stderr=True)
     shown = _log_level(args)
     terminal = RichHandler(shown, console=console, show_path=False, show_time=False)
     logging.basicConfig(level=shown, format="%(message)s", handlers=[terminal], force=True)
+    logging.captureWarnings(True)
+    logging.getLogger("py.warnings").setLevel(logging.WARNING if args.verbose else logging.CRITICAL)  # for developers
     logging.getLogger("mastd3r").setLevel(logging.INFO)  # for run.log; the terminal's own level stays
     args.words = ["mastd3r", *words]
     code: int = args.act(args, console)

@@ -11,6 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import ConfigError
+from .options import path
+from .screen import screen
 
 if TYPE_CHECKING:
     from ..download.dataset_types import Dataset
@@ -23,7 +25,7 @@ def download_parser(p: argparse.ArgumentParser) -> None:
     """Fill in the parser of ``download``."""
     p.add_argument("dataset", nargs="?", default=LIST, help="a name of the list; without one, the list is shown")
     p.add_argument("sequences", nargs="*", metavar="SEQUENCE", help="which; 'all'; without one, they are listed")
-    p.add_argument("--to", type=Path, default=Path("datasets"), metavar="DIR", help="where to (default datasets)")
+    p.add_argument("--to", type=path, default=Path("datasets"), metavar="DIR", help="where to (default datasets)")
     p.add_argument("--yes", action="store_true", help="accept the licence without being asked")
     p.add_argument("--quiet", action="store_true", help="no progress bars")
     p.set_defaults(act=_download)
@@ -35,7 +37,7 @@ def _download(args: argparse.Namespace, console: Console) -> int:
     from ..progress import FileBars, Silent
     from .terminal import Terminal
 
-    out = Console()
+    out = screen()
     if args.dataset == LIST:
         return _list(args.sequences, out)
     dataset = dataset_of(args.dataset)

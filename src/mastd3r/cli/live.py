@@ -6,7 +6,6 @@ import argparse
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 from rich.console import Console
@@ -14,7 +13,8 @@ from rich.console import Console
 from ..config import PRESETS, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..registry import ALIGNMENT
-from .options import config_from_args
+from .options import config_from_args, path
+from .screen import screen
 from .view import told_at
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ PIXEL_FORMATS = ("bgr24", "rgb24", "gray8")
 def live_parser(p: argparse.ArgumentParser) -> None:
     """Words and options of ``mastd3r live``."""
     p.add_argument("camera", metavar="CAMERA", help=CAMERA_HELP)
-    p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("--out", type=path, required=True, help="run folder")
     p.add_argument("--overwrite", action="store_true", help="remove an earlier run in --out at once, its frames too")
     p.add_argument("--record", action="store_true", help="keep the frames that are tracked, for mastd3r finish")
     p.add_argument("--seconds", type=float, metavar="S", help="end so long after the first frame (default: Ctrl-C)")
@@ -42,7 +42,7 @@ def live_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--pace", type=float, metavar="FPS", help="play files at so many frames a second, not their own")
     p.add_argument("--timeout", type=float, metavar="S", help="without a frame, after which it is lost (default 10)")
     p.add_argument("--reconnect", type=float, metavar="S", help="look for a lost camera for so long (default: not)")
-    p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
+    p.add_argument("--config", type=path, help="YAML file with options that differ from the defaults")
     p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help="as for run")
@@ -61,7 +61,7 @@ def live_parser(p: argparse.ArgumentParser) -> None:
 
 def finish_parser(p: argparse.ArgumentParser) -> None:
     """Words and options of ``mastd3r finish``."""
-    p.add_argument("run", type=Path, help="folder of a live run with --record; options are those that it had")
+    p.add_argument("run", type=path, help="folder of a live run with --record; options are those that it had")
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=finish)
 
@@ -97,7 +97,7 @@ def live(args: argparse.Namespace, console: Console) -> int:
         )
     show(result)
     if args.record:
-        Console().print(f"mastd3r finish {args.out} makes the rest", soft_wrap=True, markup=False)
+        screen().print(f"mastd3r finish {args.out} makes the rest", soft_wrap=True, markup=False)
     return 0
 
 

@@ -5,9 +5,16 @@ from __future__ import annotations
 import argparse
 import math
 from dataclasses import replace
+from pathlib import Path
 
 from ..config import Config, check_config, config_from_yaml, preset, with_override
 from ..errors import ConfigError
+from ..reading.files import short, user_path
+
+
+def path(text: str) -> Path:
+    """A path among the words of the command line, ``~`` expanded. Raises ConfigError for one that no file can have."""
+    return user_path(text or ".", refusal=ConfigError)
 
 
 def config_from_args(args: argparse.Namespace) -> Config:
@@ -59,7 +66,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     try:
         numbers = tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:
-        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got {text!r}") from e
+        raise ConfigError(f"--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got {short(repr(text))}") from e
     if not numbers:
         raise ConfigError("--intrinsics: expected fx,fy,cx,cy and OpenCV's distortion, got nothing")
     return numbers

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import difflib
+import re
 from pathlib import Path
 from typing import NoReturn, get_args
 
@@ -10,14 +12,17 @@ from .. import __version__
 from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..export.kinds import KINDS
+from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
 from .download import download_parser
 from .live import finish_parser, live_parser
+from .options import path
 from .view import view_parser
 from .weights import weights_parser
 
+MOST_SHOWN = 400  # characters of what argparse says
 INTRINSICS_HELP = "a calibrated camera in pixels of the full-size image, OpenCV's distortion; or dataset: its own"
 QUALITY_HELP = (
     "image width, steps and number of Gaussians of the map, more on an accelerator than on the CPU "
@@ -34,7 +39,29 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, as everything else does."""
 
     def error(self, message: str) -> NoReturn:
-        raise ConfigError(f"{message}; see {self.prog} --help")
+        raise ConfigError(f"{short(message, MOST_SHOWN)}{self._near(message)}; see {self.prog} --help")
+
+    def _near(self, message: str) -> str:
+        """What was perhaps meant, of the commands, choices and options there are."""
+        unknown = re.search(r"unrecognized arguments: (--?[\w-]+)|invalid choice: '([^']*)'", message)
+        if unknown is None:
+            return ""
+        word = unknown[1] or unknown[2]
+        near = difflib.get_close_matches(word, self._options() if unknown[1] else self._choices(message), n=1)
+        return f"; perhaps you meant {near[0]}" if near else ""
+
+    def _options(self) -> list[str]:
+        own = [word for action in self._actions for word in action.option_strings]
+        commands = [c for a in self._actions if isinstance(a.choices, dict) for c in a.choices.values()]
+        return own + [word for command in commands for word in command._options()]
+
+    def _choices(self, message: str) -> list[str]:
+        named = [a for a in self._actions if a.choices and message.startswith(f"argument {_name_of(a)}:")]
+        return [str(choice) for action in named for choice in action.choices or ()]
+
+
+def _name_of(action: argparse.Action) -> str:
+    return "/".join(action.option_strings) or str(action.metavar or action.dest)
 
 
 def parser() -> argparse.ArgumentParser:
@@ -44,14 +71,14 @@ def parser() -> argparse.ArgumentParser:
     known = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(known.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
     again = known.add_parser("resume", help="go on with a run that was stopped, from its last checkpoint")
-    again.add_argument("run", type=Path, help="run folder; source and options are those that it was started with")
+    again.add_argument("run", type=path, help="run folder; source and options are those that it was started with")
     again.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     again.set_defaults(act=commands.resume)
     live_parser(known.add_parser("live", help="track a camera, stream or recording while it runs"))
     finish_parser(known.add_parser("finish", help="offline masks, cloud and map of a live run that kept its frames"))
     _map_parser(known.add_parser("map", help="go on with the map of a run that has ended"))
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
-    demo.add_argument("--out", type=Path, default=Path("runs/demo"), help="run folder (default runs/demo)")
+    demo.add_argument("--out", type=path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")
     demo.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     demo.set_defaults(act=commands.demo)
@@ -63,25 +90,27 @@ def parser() -> argparse.ArgumentParser:
     download_parser(known.add_parser("download", help="list and bring the public datasets"))
     doctor = known.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=commands.doctor)
+    for command in known.choices.values():
+        command.add_argument("-v", "--verbose", action="store_true", default=argparse.SUPPRESS, help="say more")
     return top
 
 
 def _map_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("run", type=Path, help="run folder; its splat, poses, renders, figures and report are renewed")
+    p.add_argument("run", type=path, help="run folder; its splat, poses, renders, figures and report are renewed")
     p.add_argument("--minutes", type=float, metavar="M", help="of training (default: as the run's config.yaml says)")
     p.add_argument(
         "--quality", choices=get_args(MapQualityKind), help="instead of the run's; the map never becomes coarser"
     )
-    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument("--source", type=path, help="where the photographs are now (default: where the run read them)")
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
     p.set_defaults(act=commands.train_map)
 
 
 def _export_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("run", type=Path, help="run folder")
+    p.add_argument("run", type=path, help="run folder")
     p.add_argument("--to", choices=tuple(KINDS), required=True, help="; ".join(f"{k}: {v}" for k, v in KINDS.items()))
-    p.add_argument("--out", type=Path, required=True, help="file or folder to write")
-    p.add_argument("--source", type=Path, help="where the photographs are now (default: where the run read them)")
+    p.add_argument("--out", type=path, required=True, help="file or folder to write")
+    p.add_argument("--source", type=path, help="where the photographs are now (default: where the run read them)")
     p.add_argument(
         "--undistort",
         action=argparse.BooleanOptionalAction,
@@ -93,23 +122,23 @@ def _export_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _eval_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("paths", type=Path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
-    p.add_argument("--trajectory", type=Path, metavar="FILE", help="poses that another system has written")
+    p.add_argument("paths", type=path, nargs="+", metavar="[RUN] SEQUENCE", help="no RUN with --trajectory")
+    p.add_argument("--trajectory", type=path, metavar="FILE", help="poses that another system has written")
     p.add_argument("--format", choices=("tum", "kitti", "euroc"), help="of that file")
-    p.add_argument("--out", type=Path, metavar="FILE", help="with --trajectory: write the figures as JSON")
+    p.add_argument("--out", type=path, metavar="FILE", help="with --trajectory: write the figures as JSON")
     p.set_defaults(act=commands.evaluate_run)
 
 
 def _run_parser(p: argparse.ArgumentParser) -> None:
-    p.add_argument("source", type=Path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
-    p.add_argument("--out", type=Path, required=True, help="run folder")
+    p.add_argument("source", type=path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
+    p.add_argument("--out", type=path, required=True, help="run folder")
     p.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
-    p.add_argument("--config", type=Path, help="YAML file with options that differ from the defaults")
+    p.add_argument("--config", type=path, help="YAML file with options that differ from the defaults")
     p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once; paper: everything as printed")
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
     p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
-    p.add_argument("--maps", type=Path, help="folder of P(movable) maps, named like the frames or by timestamp")
+    p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)

@@ -5,20 +5,21 @@ from __future__ import annotations
 import argparse
 import time
 import webbrowser
-from pathlib import Path
 
 from rich.console import Console
 
 from ..errors import ConfigError, InputError
 from ..viewer.server import HOW_TO_GET, LOOPBACK, is_installed
+from .options import path
+from .screen import screen
 
 LONG_S = 3600.0
 
 
 def view_parser(p: argparse.ArgumentParser) -> None:
     """The words of ``view``."""
-    p.add_argument("run", type=Path, help="run folder")
-    p.add_argument("--file", type=Path, action="append", default=[], help="an exported cloud or mesh to show with it")
+    p.add_argument("run", type=path, help="run folder")
+    p.add_argument("--file", type=path, action="append", default=[], help="an exported cloud or mesh to show with it")
     p.add_argument("--host", default=LOOPBACK, help=f"address to serve on (default {LOOPBACK}: this machine alone)")
     p.add_argument("--port", type=_port, help="port to serve on (default: a free one from 8080 on)")
     p.add_argument("--no-browser", action="store_true", help="say the address, open nothing")
@@ -43,7 +44,7 @@ def view(args: argparse.Namespace, console: Console) -> int:
 
 def told_at(address: str, args: argparse.Namespace, console: Console) -> None:
     """Say where a viewer is served, and open it where a browser is and may be."""
-    Console().print(f"{address}  (Ctrl-C ends it)", soft_wrap=True, markup=False, highlight=False)
+    screen().print(f"{address}  (Ctrl-C ends it)", soft_wrap=True, markup=False, highlight=False)
     if not args.no_browser and not _browse(address):
         console.print("no browser found: open that address in one", markup=False)
 
@@ -54,7 +55,7 @@ def _open_report(args: argparse.Namespace) -> None:
     report = read_run(args.run).path / "report.html"
     if not report.is_file():
         raise InputError(f"{report}: expected the report of a complete run, got none")
-    console = Console()
+    console = screen()
     if not args.report:
         console.print(f"the viewer is not installed ({HOW_TO_GET}): the report instead", markup=False, soft_wrap=True)
     console.print(f"report: {report}", soft_wrap=True, markup=False)

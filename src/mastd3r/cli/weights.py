@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import ConfigError, InputError
+from .screen import screen
 
 if TYPE_CHECKING:
     from ..download.weights_download import Accept
@@ -46,7 +47,7 @@ def _list(args: argparse.Namespace, console: Console) -> int:
     for entry in entries():
         size = human_bytes(entry.size_bytes) if entry.size_bytes else "–"
         table.add_row(entry.name, STATE_SHOWN[entry.state], size, entry.licence, entry.what)
-    out = Console()
+    out = screen()
     out.print(table)
     out.print(
         f"They lie in {home() / 'weights'}; MASTD3R_HOME moves them.", highlight=False, soft_wrap=True, markup=False
@@ -64,7 +65,7 @@ def _download(args: argparse.Namespace, console: Console) -> int:
         got = download(args.what, _accept(args.yes, console), as_name=args.as_name, watch=bars.watch)
     if (got if got.is_dir() else got.parent).name not in KNOWN:
         console.print("The licence of these weights is not known here: see the page that they come from.")
-    Console().print(f"ready: {got}", highlight=False, soft_wrap=True, markup=False)
+    screen().print(f"ready: {got}", highlight=False, soft_wrap=True, markup=False)
     return 0
 
 
@@ -88,7 +89,7 @@ def _check(args: argparse.Namespace, console: Console) -> int:
 
     names = [args.what] if args.what else [e.name for e in entries() if e.state == "installed"]
     if not names:
-        Console().print("no weights are installed; mastd3r weights list shows what there is")
+        screen().print("no weights are installed; mastd3r weights list shows what there is")
         return 0
     table = Table("file", "size", "sha256", "")
     wrong = []
@@ -101,7 +102,7 @@ def _check(args: argparse.Namespace, console: Console) -> int:
                 verdict = f"[red]wrong[/red], expected {file.expected}"
                 wrong.append(file.path)
             table.add_row(str(file.path), human_bytes(file.size_bytes), file.sha256[:12], verdict)
-    Console().print(table)
+    screen().print(table)
     if wrong:
         text = f"{wrong[0]}: expected the checksum of its release or first download, got another"
         raise InputError(f"{text}; remove it and download it again")

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+UNPACKED_RATIO = 4  # what an archive may hold, over its own size: its pictures are compressed already
+UNPACKED_LEAST_BYTES = 64 * 2**20  # and this much in any case: lists and poses are text
+
 
 @dataclass(frozen=True)
 class Archive:

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ConfigError, InputError, OutputError
+from ..reading.files import whole_json
 from .archives import Damaged, unpack
 from .dataset_types import Archive, Dataset, Part, Sequence
 from .datasets_known import KNOWN
@@ -173,10 +174,9 @@ def _is_whole(folder: Path, sequence: Sequence, record: dict[str, Any]) -> bool:
 
 
 def _read_record(folder: Path) -> dict[str, Any]:
-    record: Any = {}
-    with suppress(OSError, ValueError):
-        record = json.loads((folder / RECORD).read_text(encoding="utf-8"))
-    record = record if isinstance(record, dict) else {}
+    record: dict[str, Any] = {}
+    with suppress(InputError):
+        record = whole_json(folder / RECORD)
     if not isinstance(record.get("sequences"), dict):
         record["sequences"] = {}
     return record

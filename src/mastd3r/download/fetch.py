@@ -24,11 +24,16 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..errors import InputError, OutputError
+from ..reading.files import check_plain, short, user_path, whole_json, why
+from .http import OPENER, whole_number
 
 CHUNK_BYTES = 1 << 20
 AGENT = "mastd3r-slam"
 TRANSIENT = {408, 425, 429, 500, 502, 503, 504}  # HTTP answers worth another try
 MAX_PAUSE_S = 30.0
+SLOWEST_BYTES_S = 1000.0  # over as long as an answer may take to begin; a connection that is slower counts as cut
+TOO_SLOW = f"slower than {SLOWEST_BYTES_S:.0f} bytes a second"
+MOST_NOTE_BYTES = 2**16  # of what is kept beside a part
 
 Progress = Callable[[int, int | None], None]  # (bytes that are there, bytes in all or None where unknown)
 
@@ -61,6 +66,7 @@ class Wanted:
 
     sha256: str | None = None  # hexadecimal
     size_bytes: int | None = None
+    most_bytes: int | None = None  # where only a bound is known
     md5: str | None = None  # hexadecimal; for servers that publish no better one
     check: Callable[[Path], None] | None = None  # raises SlamError for a file whose content is no good
 
@@ -85,6 +91,7 @@ def fetch(
     Raises Unreachable, Interrupted, OutputError (these leave the part), and InputError: refused, or of the wrong
     length, checksum or content, with the part removed.
     """
+    user_path(_beside(target, ".part.json"), str(short(str(source))))  # the longest name of them
     if want.sha256 and target.is_file() and sha256_of(target) == want.sha256:
         return Fetched(target, target.stat().st_size, want.sha256, 0)
     with _writing(target):
@@ -110,7 +117,7 @@ def fetch(
 def local_path(source: str | Path) -> Path | None:
     """The file that a path or a file URL names; None for a URL of the net. Raises InputError for other schemes."""
     if isinstance(source, Path) or "://" not in source:
-        return Path(source).expanduser()
+        return user_path(source)
     scheme, _, rest = source.partition("://")
     if scheme.lower() in ("http", "https"):
         return None
@@ -130,6 +137,7 @@ def md5_of(path: Path) -> str:
 
 
 def _digest(path: Path, kind: str) -> str:
+    check_plain(path, "a readable file")
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, kind).hexdigest()
@@ -174,7 +182,7 @@ class _Transfer:
             if reason is None:
                 return
             failures += 1
-            if (have := self.have()) > best:
+            if (have := self.have()) > best and reason != TOO_SLOW:
                 best, failures = have, 1
             if failures >= (attempts if self.answered else min(attempts, 2)):
                 raise self._gave_up(target, reason)
@@ -198,9 +206,10 @@ class _Transfer:
             if e.code == http.HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
                 return self._past_the_end(e)
             if e.code not in TRANSIENT:
-                raise InputError(f"{self.url}: expected a file to download, got HTTP {e.code} {e.reason}") from e
-            after = e.headers.get("Retry-After", "")
-            self.wait_s = float(after) if after.isdigit() else 0.0
+                raise InputError(
+                    f"{self.url}: expected a file to download, got HTTP {e.code} {short(str(e.reason))}"
+                ) from e
+            self.wait_s = float(whole_number(e.headers.get("Retry-After")) or 0)
             return f"HTTP {e.code}"
         except _Again as e:
             self.forget()
@@ -214,7 +223,7 @@ class _Transfer:
 
     def _past_the_end(self, answer: urllib.error.HTTPError) -> str | None:
         """HTTP 416: the server has nothing behind what is there."""
-        length = re.fullmatch(r"bytes \*/(\d+)", answer.headers.get("Content-Range", ""))
+        length = re.fullmatch(r"bytes \*/([0-9]{1,18})", answer.headers.get("Content-Range", ""))
         expected = self.want.size_bytes or (self._note() or {}).get("total")
         if length and int(length[1]) == self.have() == expected:
             self.total = expected
@@ -231,7 +240,7 @@ class _Transfer:
             if validator := _strong(note):
                 headers["If-Range"] = validator
         request = urllib.request.Request(self.url, headers=headers)
-        with urllib.request.urlopen(request, timeout=self.timeout_s) as answer:
+        with OPENER.open(request, timeout=self.timeout_s) as answer:
             self.answered = True
             start = self._start(answer, have, note)
             with _writing(self.part), self.part.open("r+b" if start else "wb", buffering=0) as file:
@@ -244,10 +253,11 @@ class _Transfer:
         """Where this answer begins in the file; 0 begins again. Raises _Again, InputError, OutputError."""
         if answer.headers.get("Content-Encoding", "identity") != "identity":
             raise InputError(f"{self.url}: expected the file as it is, got it encoded by the server")
-        length = answer.headers.get("Content-Length", "")
-        start, total = 0, int(length) if length.isdigit() else None
+        start, total = 0, whole_number(answer.headers.get("Content-Length"))
         if answer.status == http.HTTPStatus.PARTIAL_CONTENT:
-            span = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", answer.headers.get("Content-Range", ""))
+            span = re.fullmatch(
+                r"bytes ([0-9]{1,18})-[0-9]{1,18}/([0-9]{1,18}|\*)", answer.headers.get("Content-Range", "")
+            )
             if span is None or int(span[1]) != have or note is None:
                 raise _Again("the server sent another range than asked for")
             start, total = have, int(span[2]) if span[2] != "*" else None
@@ -264,20 +274,28 @@ class _Transfer:
         return start
 
     def _receive(self, answer: Any, file: BinaryIO, start: int) -> None:
-        done = start
+        done = checked = start
+        began = time.monotonic()
         self.progress(done, self.total)
         while chunk := _network(answer.read1, CHUNK_BYTES):
             file.write(chunk)
             done += len(chunk)
             self.progress(done, self.total)
+            if done > (self.want.most_bytes or done):
+                raise InputError(f"{self.url}: expected at most {human_bytes(self.want.most_bytes)}, got more")
+            if (waited_s := time.monotonic() - began) > self.timeout_s:
+                if done - checked < SLOWEST_BYTES_S * waited_s:
+                    raise _NetworkTrouble(TOO_SLOW)
+                began, checked = time.monotonic(), done
 
     def _note(self) -> dict[str, Any] | None:
         """What the part is the beginning of; None where that is not known, or is another URL."""
         try:
-            note = json.loads(self.note_path.read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            note = whole_json(self.note_path, most=MOST_NOTE_BYTES)
+        except InputError:
             return None
-        return note if isinstance(note, dict) and note.get("url") == self.url else None
+        known = all(note.get(k) is None or isinstance(note[k], str) for k in ("etag", "modified"))
+        return note if known and note.get("url") == self.url else None
 
     def _write_note(self, note: dict[str, Any]) -> None:
         with _writing(self.note_path):
@@ -327,11 +345,11 @@ def _check_space(path: Path, needed: int) -> None:
 
 def _copy(source: Path, part: Path, want: Wanted, progress: Progress) -> None:
     """A local file to the part. Raises InputError, OutputError."""
+    total, done = check_plain(source, "a file"), 0
     try:
-        total, done = source.stat().st_size, 0
         file = source.open("rb")
     except OSError as e:
-        raise InputError(f"{source}: expected a file, got {e.strerror or e}") from e
+        raise InputError(f"{source}: expected a file, got {why(e)}") from e
     with file:
         if want.size_bytes not in (None, total):
             raise InputError(f"{source}: expected {want.size_bytes} bytes, got {total}")

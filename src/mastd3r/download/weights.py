@@ -12,12 +12,14 @@ import json
 import os
 import re
 import sys
+import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import ConfigError, InputError, OutputError
+from ..reading.files import check_plain, entries_of, whole_json
 from .fetch import human_bytes, sha256_of
 from .weights_known import KNOWN, Known, Origin
 
@@ -60,12 +62,17 @@ def home() -> Path:
     if chosen := os.environ.get("MASTD3R_HOME"):
         return Path(chosen).expanduser()
     if sys.platform == "win32":
-        cache = os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local"
+        cache = os.environ.get("LOCALAPPDATA") or _user() / "AppData" / "Local"
     elif sys.platform == "darwin":
-        cache = Path.home() / "Library" / "Caches"
+        cache = _user() / "Library" / "Caches"
     else:
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        cache = os.environ.get("XDG_CACHE_HOME") or _user() / ".cache"
     return Path(cache) / "mastd3r"
+
+
+def _user() -> Path:
+    """The user's own folder; that of the system for the time being, for a user without (in containers)."""
+    return Path(own) if (own := os.path.expanduser("~")) != "~" else Path(tempfile.gettempdir())
 
 
 def folder_of(name: str) -> Path:
@@ -119,7 +126,7 @@ def check(what: str) -> list[Checked]:
     """
     files: list[Path]
     if (own := own_path(what)) is not None:
-        files = [own] if own.is_file() else sorted(p for p in own.iterdir() if p.suffix in TENSORS)
+        files = [own] if own.is_file() else [p for p in entries_of(own) if p.suffix in TENSORS]
     else:
         folder = folder_of(name_of(what))
         # A file of the wrong size is not present, but is what a check is there to find.
@@ -192,12 +199,16 @@ def own_path(what: str) -> Path | None:
     if what in KNOWN or (is_name(what) and folder_of(what).is_dir()):
         return None
     given = os.path.expanduser(what)
-    return Path(given) if os.path.exists(given) else None
+    if not os.path.exists(given):
+        return None
+    if not (os.path.isfile(given) or os.path.isdir(given)):
+        check_plain(Path(given), "a file or folder of weights")
+    return Path(given)
 
 
 def is_name(text: str) -> bool:
     """Whether weights may be called so: it becomes the name of a folder."""
-    return re.fullmatch(r"[A-Za-z0-9][\w.-]*", text) is not None
+    return re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}", text) is not None
 
 
 def name_of(what: str) -> str:
@@ -232,13 +243,14 @@ def write_record(
 
 def read_json(file: Path) -> dict[str, Any]:
     """An empty mapping where there is no such file. Raises InputError for a damaged one."""
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not os.path.lexists(file):
         return {}
-    except (OSError, ValueError) as e:
-        raise InputError(f"{file}: expected readable JSON, got {e}; remove it") from e
-    if not isinstance(data, dict) or not isinstance(data.get("files", {}), dict):
+    try:
+        data = whole_json(file)
+    except InputError as e:
+        raise InputError(f"{e}; remove it") from e
+    files = data.get("files", {})
+    if not isinstance(files, dict) or not all(isinstance(f, dict) for f in files.values()):
         raise InputError(f"{file}: expected the record of some weights, got something else; remove it")
     return data
 

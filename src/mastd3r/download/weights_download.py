@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -10,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ConfigError, InputError
+from ..reading.files import entries_of, short, whole_json
 from .fetch import Progress, Unreachable, Wanted, fetch, local_path
 from .weights import (  # fmt: skip
     NAMELESS,
@@ -33,6 +33,7 @@ from .weights import (  # fmt: skip
 from .weights_known import KNOWN, Known, KnownFile, Licence, Origin, hub
 
 Accept = Callable[[Licence], bool]
+MOST_LISTING_BYTES = 16 * 2**20
 Watch = Callable[[str], Progress]  # file name -> where its progress is told
 
 
@@ -119,7 +120,7 @@ def _folder_plan(folder: Path, as_name: str | None) -> _Plan:
     if known := KNOWN.get(name):
         files = [(folder / f.name, f) for f in known.origins[0].files]
     else:
-        there = sorted(p for p in folder.iterdir() if p.name == "config.json" or p.name.endswith(TENSORS[0]))
+        there = sorted(p for p in entries_of(folder) if p.name == "config.json" or p.name.endswith(TENSORS[0]))
         files = [(p, KnownFile(p.name)) for p in there]
     if not any(f.name.endswith(TENSORS) for _, f in files):
         raise InputError(f"{folder}: expected config.json and *.safetensors, got no tensors")
@@ -168,19 +169,21 @@ def _released(name: str, file_name: str) -> KnownFile:
 def _hub_files(hub_id: str, revision: str) -> list[KnownFile]:
     """Names, sizes and checksums of a hub repository's top folder. Raises InputError."""
     listing = home() / "listing.json"
-    fetch(f"{hub()}/api/models/{hub_id}/revision/{revision}?blobs=true", listing)
+    fetch(f"{hub()}/api/models/{hub_id}/revision/{revision}?blobs=true", listing, Wanted(most_bytes=MOST_LISTING_BYTES))
     try:
-        data = json.loads(listing.read_text(encoding="utf-8"))
+        data = whole_json(listing)
         files = []
         for entry in data["siblings"]:
             large = entry.get("lfs") or {}
-            size = large.get("size") or entry.get("size")
-            files.append(KnownFile(str(entry["rfilename"]), size, large.get("sha256")))
-    except (ValueError, KeyError, TypeError, AttributeError) as e:
+            size, sha256 = large.get("size") or entry.get("size"), large.get("sha256")
+            if not isinstance(size, int | None) or not isinstance(sha256, str | None):
+                raise TypeError(f"size {short(repr(size))}, sha256 {short(repr(sha256))}")
+            files.append(KnownFile(str(entry["rfilename"]), size, sha256))
+    except (InputError, KeyError, TypeError, AttributeError) as e:
         raise InputError(f"{hub()}/{hub_id}: expected a list of files, got something else ({e})") from e
     finally:
         listing.unlink(missing_ok=True)
-    return [f for f in files if not set("/\\") & set(f.name)]
+    return [f for f in files if is_name(f.name)]
 
 
 def _agree(licence: Licence, accept: Accept) -> None:

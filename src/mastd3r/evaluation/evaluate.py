@@ -13,15 +13,18 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
+from ..reading.files import whole_bytes, whole_text
+from ..reading.pictures import decoded
 from ..types import Frame, State, Trajectory, Truth
 from .image_error import psnr, ssim
-from .mask_error import MaskError, mask_error, read_mask
+from .mask_error import MaskError, TrueMasks, mask_error, read_mask
 from .trajectory_error import AteResult, associate, ate_of_positions, ate_rmse, drift_distance, rpe, rpe_over_distance
 
 Array = NDArray[Any]
 PSNR_CEILING_DB = float(10 * np.log10(255**2 / 1e-9))  # stands for equal images, so that a mean exists
 SAME_TIME_S = 0.001  # other systems round timestamps in ways of their own
 OPAQUE = 0.95  # alpha above which nothing is seen through
+FARTHEST, SHORTEST = 1e9, 1e-6  # of positions and quaternions in a file; others are no pose
 MIN_STATIC_PX = 50  # fewer static pixels in a render say nothing
 
 
@@ -67,7 +70,7 @@ def evaluate(
     """
     trajectory = read_poses(run_dir / "trajectory.txt")
     times, positions = trajectory.timestamps_s, trajectory.world_from_cam[:, :3, 3]
-    moving = {_stamp(t): path for t, path in truth.moving_files.items()} if truth else {}
+    moving = TrueMasks({_stamp(t): path for t, path in truth.moving_files.items()} if truth else {})
     seen, holdout = _compare_renders(run_dir, frames, moving)
     stamps = seen if timestamps_s is None else [_stamp(float(t)) for t in timestamps_s]
     posed = {_stamp(float(t)) for t in times[np.isfinite(positions).all(1)]}
@@ -80,6 +83,7 @@ def evaluate(
     if (run_dir / "cloud.ply").is_file():
         metrics["cloud_mib"] = (run_dir / "cloud.ply").stat().st_size / 2**20
     _add_masks(metrics, _masks(run_dir, stamps, moving), has_truth=bool(moving))
+    moving.tell()
     return Evaluation(metrics, ate, tuple(holdout))
 
 
@@ -122,10 +126,7 @@ def read_positions(path: Path) -> tuple[Array, Array]:
 
 def read_poses(path: Path) -> Trajectory:
     """Every row of a TUM trajectory file, in order of time. Raises InputError."""
-    try:
-        lines = path.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
+    lines = whole_text(path, "a readable trajectory file").splitlines()
     rows: list[list[float]] = []
     for number, line in enumerate(lines, 1):
         if not line.strip() or line.startswith("#"):
@@ -143,9 +144,9 @@ def read_poses(path: Path) -> Trajectory:
     data = data[np.argsort(data[:, 0], kind="stable")]
     poses = np.tile(np.eye(4), (len(data), 1, 1))
     poses[:, :3, 3] = data[:, 1:4]
-    known = np.isfinite(data[:, 4:]).all(1)
+    known = np.isfinite(data).all(1) & (np.abs(data[:, 1:]) < FARTHEST).all(1) & (np.abs(data[:, 4:]).max(1) > SHORTEST)
     poses[known, :3, :3] = Rotation.from_quat(data[known, 4:]).as_matrix()
-    poses[~known, :3, :3] = np.nan
+    poses[~known, :3] = np.nan
     tracked: State = "tracked"
     return Trajectory(data[:, 0], poses, (tracked,) * len(data), np.zeros(len(data), bool))
 
@@ -190,9 +191,7 @@ def _add_keyframe_error(metrics: dict[str, Any], run_dir: Path, truth: Truth) ->
         metrics["ate_rmse_keyframes_note"] = kf.reason
 
 
-def _compare_renders(
-    run_dir: Path, frames: Iterable[Frame], moving: dict[str, str]
-) -> tuple[list[str], list[HoldoutError]]:
+def _compare_renders(run_dir: Path, frames: Iterable[Frame], moving: TrueMasks) -> tuple[list[str], list[HoldoutError]]:
     """One pass over the frames: all their stamps, and the errors of those that have a render."""
     renders = {p.stem: p for p in (run_dir / "renders").glob("*.png")}
     seen: list[str] = []
@@ -201,8 +200,10 @@ def _compare_renders(
         stamp = _stamp(frame.timestamp_s)
         seen.append(stamp)
         if stamp in renders:
-            truth = read_mask(moving[stamp]) if stamp in moving else None
-            holdout.append(_compare(frame, renders[stamp], truth, has_masks=bool(moving)))
+            truth = moving.read(stamp)
+            holdout.append(
+                _compare(frame, renders[stamp], truth, has_masks=bool(moving) and stamp not in moving.broken)
+            )
     if renders and not holdout:
         raise InputError(
             f"{run_dir}/renders: expected timestamps of the sequence given, got {min(renders)} and others "
@@ -213,9 +214,7 @@ def _compare_renders(
 
 def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: bool) -> HoldoutError:
     """A render of the file alone, over black, with the photograph; over white by alpha/ where that is."""
-    render = cv2.imread(str(render_path), cv2.IMREAD_COLOR)
-    if render is None:
-        raise InputError(f"{render_path}: expected a PNG image, got a file that is not one")
+    render = decoded(whole_bytes(render_path, "a PNG image"), render_path, cv2.IMREAD_COLOR)
     size = (render.shape[1], render.shape[0])
     photograph = np.asarray(cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)) / 255
     splat = np.asarray(render)[..., ::-1] / 255
@@ -270,13 +269,10 @@ def _add_holdout(metrics: dict[str, Any], holdout: list[HoldoutError]) -> None:
             metrics[key] = float(np.mean(known))
 
 
-def _masks(run_dir: Path, stamps: list[str], moving: dict[str, str]) -> MaskError:
+def _masks(run_dir: Path, stamps: list[str], moving: TrueMasks) -> MaskError:
     present = {p.stem for p in (run_dir / "masks").glob("*.png")}
-    return mask_error(
-        (read_mask(run_dir / "masks" / f"{s}.png"), read_mask(moving[s]) if s in moving else None)
-        for s in stamps
-        if s in present
-    )
+    pairs = ((read_mask(run_dir / "masks" / f"{s}.png"), moving.read(s), s) for s in stamps if s in present)
+    return mask_error((mask, true) for mask, true, s in pairs if s not in moving.broken)
 
 
 def _add_masks(metrics: dict[str, Any], masks: MaskError, has_truth: bool) -> None:

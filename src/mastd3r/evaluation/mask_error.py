@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import logging
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.files import whole_bytes
+from ..reading.pictures import decoded
 
 Array = NDArray[Any]
+log = logging.getLogger(__name__)
 MIN_MOVING_RATIO = 0.01  # below this share of moving pixels, IoU says little
 
 
@@ -26,6 +30,33 @@ class MaskError:
     called_moving_ratio: float | None  # mean share of pixels called moving, all frames
     n_frames: int  # frames with an estimated mask
     n_moving: int  # of these, frames that IoU is the mean of
+
+
+class TrueMasks:
+    """The true masks of a sequence by stamp; those that cannot be read are left out, and told of: they stop no run."""
+
+    def __init__(self, files: Mapping[str, str]) -> None:
+        self._files = dict(files)
+        self.broken: dict[str, str] = {}  # stamp -> what is wrong
+
+    def __bool__(self) -> bool:
+        return bool(self._files)
+
+    def read(self, stamp: str) -> Array | None:
+        """(h, w) uint8; None where there is none: nothing moves there, unless the stamp is among ``broken``."""
+        if stamp not in self._files or stamp in self.broken:
+            return None
+        try:
+            return read_mask(self._files[stamp])
+        except InputError as e:
+            self.broken[stamp] = str(e)
+            return None
+
+    def tell(self) -> None:
+        """Log how many were left out."""
+        if self.broken:
+            first = next(iter(self.broken.values()))
+            log.warning("true masks that cannot be read are left out: %d, the first: %s", len(self.broken), first)
 
 
 def mask_error(pairs: Iterable[tuple[Array, Array | None]]) -> MaskError:
@@ -49,14 +80,8 @@ def mask_error(pairs: Iterable[tuple[Array, Array | None]]) -> MaskError:
 
 def read_mask(path: Path | str) -> Array:
     """An 8-bit image as (h, w) uint8. Raises InputError where it is missing or unreadable."""
-    try:
-        data = np.frombuffer(Path(path).read_bytes(), np.uint8)
-    except OSError as e:
-        raise InputError(f"mask {path}: expected a readable image, got {e.strerror or e}") from e
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    if image is None:
-        raise InputError(f"mask {path}: expected an image, got {data.size} bytes that are not one")
-    return np.asarray(image)
+    path = Path(path)
+    return np.asarray(decoded(whole_bytes(path, "a readable image"), path, cv2.IMREAD_GRAYSCALE))
 
 
 def _mean(values: list[float]) -> float | None:

@@ -21,6 +21,7 @@ from .store import Store, command_of, record_of
 from .suite import Entry
 
 POLL_S = 0.1
+LOG_END_BYTES = 2**16  # of what an entry has said, its last line is looked for in
 END_S = 20.0  # for a run to save what it has, once it is told to stop
 MEMORY_SHARE = 0.8  # of the machine's, where --memory-mib is not given
 Launch = Callable[[Entry, Path, Path], list[str]]  # entry, sequence folder, run folder -> argument vector
@@ -157,12 +158,19 @@ def _recorded(finished: Running, store: Store) -> dict[str, Any]:
         entry,
         store.run_folder(entry),
         exit_code=finished.process.returncode,
-        said=log.read_text(errors="replace"),
+        said=_last_of(log),
         wall_s=time.monotonic() - finished.began_s,
         jobs=finished.jobs,
     )
     store.put(entry, record)
     return record
+
+
+def _last_of(log: Path) -> str:
+    """The end of what an entry has said."""
+    with log.open("rb") as file:
+        file.seek(max(0, log.stat().st_size - LOG_END_BYTES))
+        return file.read().decode("utf-8", "replace")
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 import time
 from collections.abc import Iterator, Sequence
@@ -17,6 +16,8 @@ from ..errors import InputError, OutputError
 from ..export.files import write_json, writing
 from ..export.machine import machine_info
 from ..export.read_run import read_json
+from ..reading.files import whole_json
+from ..registry import LARGEST
 from .suite import Entry, SequenceSpec, Suite
 
 PATH_POINTS = 150  # of a path that is kept for the plots
@@ -90,10 +91,16 @@ class Store:
                 record = read_json(path)
             except InputError:  # half a file from outside: as if it were not there
                 continue
-            key, peak = (record.get("sequence"), record.get("variant")), record.get("metrics", {}).get("peak_rss_mib")
-            if peak and record.get("status") == "complete":
+            key, peak = (record.get("sequence"), record.get("variant")), _peak_mib(record)
+            if peak and record.get("status") == "complete" and all(isinstance(k, str) for k in key):
                 seen[key] = max(peak, seen.get(key, 0.0))
         return {e.id: seen.get((e.sequence.name, e.variant.name), e.variant.memory_mib) for e in entries}
+
+
+def _peak_mib(record: dict[str, Any]) -> float:
+    metrics = record.get("metrics")
+    peak = metrics.get("peak_rss_mib") if isinstance(metrics, dict) else None
+    return float(peak) if isinstance(peak, int | float) and 0 < peak < LARGEST else 0.0
 
 
 def described(entry: Entry) -> dict[str, Any]:
@@ -220,8 +227,8 @@ def _read(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, ValueError):
+        return whole_json(path)
+    except InputError:
         return {}  # the run ended while it wrote: the record says that it failed
 
 

@@ -14,16 +14,19 @@ import difflib
 import fnmatch
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
 from ..config import Config, config_to_yaml, with_override
 from ..errors import ConfigError, InputError
 from ..export.metric_names import NAMES
+from ..reading.files import entries_of as entries_in
+from ..reading.files import is_file, short, user_path
+from ..reading.yaml_text import yaml_file, yaml_value
+from ..registry import LARGEST
 from .published import published_table
 
 SHIPPED = Path(__file__).parents[1] / "suites"
@@ -46,7 +49,7 @@ class SequenceSpec:
         """Its folder, or None where it is missing."""
         wanted = self.folder or self.name
         places = [data / wanted, data / self.dataset / wanted, data / self.name, data / self.dataset / self.name]
-        return next((place for place in places if place.is_dir()), None)
+        return next((place for place in places if os.path.isdir(place)), None)
 
     def how_to_get(self) -> str:
         """The command that brings it; nothing where none does."""
@@ -120,17 +123,13 @@ def load_suite(name: str) -> Suite:
     """A shipped suite by its name, or a file of the user's. Raises ConfigError."""
     path = SHIPPED / f"{name}.yaml"
     if name not in shipped_suites():
-        path = Path(name)
-        if not path.is_file():
+        path = user_path(name, "suite", ConfigError)
+        if not is_file(path):
             near = difflib.get_close_matches(name, shipped_suites(), n=1)
             hint = f"; perhaps you meant {near[0]}" if near else ""
             known = ", ".join(shipped_suites())
             raise ConfigError(f"suite: expected one of {known}, or a YAML file, got {name!r}{hint}")
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
-        raise ConfigError(f"suite {path}: expected readable YAML, got {' '.join(str(e).split())}") from e
-    return suite_from_dict(data, path.stem)
+    return suite_from_dict(yaml_file(path, "suite", ConfigError), path.stem)
 
 
 def suite_from_dict(data: Any, name: str) -> Suite:
@@ -175,7 +174,7 @@ def sequences_of(suite: Suite, data: Path, names: Sequence[str] | None = None) -
         return tuple(known[n] for n in names) if names else suite.sequences
     if names:
         return tuple(SequenceSpec(n) for n in names)
-    found = [p.name for p in sorted(data.iterdir()) if (p / "rgb.txt").is_file() and (p / "groundtruth.txt").is_file()]
+    found = [p.name for p in entries_in(data) if is_file(p / "rgb.txt") and is_file(p / "groundtruth.txt")]
     if not found:
         raise InputError(f"--data {data}: expected folders with rgb.txt and groundtruth.txt, got none")
     return tuple(SequenceSpec(n) for n in found)
@@ -225,12 +224,12 @@ def _plain(name: str) -> str:
 
 def _mapping(data: Any, where: str, known: set[str] | None = None, needed: set[str] | None = None) -> dict[str, Any]:
     if not isinstance(data, Mapping):
-        raise ConfigError(f"{where}: expected key: value pairs, got {data!r}")
+        raise ConfigError(f"{where}: expected key: value pairs, got {short(repr(data))}")
     for key in data:
         if not isinstance(key, str) or (known is not None and key not in known):
             near = difflib.get_close_matches(str(key), known or (), n=1)
             hint = f"; perhaps you meant {near[0]}" if near else f"; known: {', '.join(sorted(known or ()))}"
-            raise ConfigError(f"{where}: unknown key {key}{hint}")
+            raise ConfigError(f"{where}: unknown key {short(str(key))}{hint}")
     lacking = sorted((needed or set()) - set(data))
     if lacking:
         raise ConfigError(f"{where}: expected {', '.join(lacking)}, got only {', '.join(data) or 'nothing'}")
@@ -249,13 +248,20 @@ def _overrides(data: Any, where: str) -> tuple[str, ...]:
 
 
 def _as_set(value: Any) -> str:
-    plain = isinstance(value, str) and yaml.safe_load(value) == value
+    plain = isinstance(value, str) and _reads_as_itself(value)
     return str(value) if plain else json.dumps(value)
 
 
+def _reads_as_itself(text: str) -> bool:
+    try:
+        return bool(yaml_value(text, "", ConfigError) == text)
+    except ConfigError:
+        return False
+
+
 def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-        raise ConfigError(f"{where}: expected a number above 0, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= LARGEST:
+        raise ConfigError(f"{where}: expected a number above 0, got {short(repr(value))}")
     return float(value)
 
 
@@ -282,7 +288,7 @@ def _sequences(data: Any, where: str) -> tuple[SequenceSpec, ...] | None:
 
 def _tables(data: Any, variants: list[str], where: str) -> tuple[TableSpec, ...]:
     if not isinstance(data, list) or not data:
-        raise ConfigError(f"{where}: expected a list of tables, got {data!r}")
+        raise ConfigError(f"{where}: expected a list of tables, got {short(repr(data))}")
     found = []
     for number, given in enumerate(data):
         at = f"{where}[{number}]"
@@ -303,10 +309,10 @@ def _tables(data: Any, variants: list[str], where: str) -> tuple[TableSpec, ...]
 
 def _names(data: Any, known: list[str], where: str) -> tuple[str, ...]:
     if not isinstance(data, list) or not data:
-        raise ConfigError(f"{where}: expected a list of names, got {data!r}")
+        raise ConfigError(f"{where}: expected a list of names, got {short(repr(data))}")
     for name in data:
         if name not in known:
             near = difflib.get_close_matches(str(name), known, n=1)
             hint = f"; perhaps you meant {near[0]}" if near else f"; known: {', '.join(known)}"
-            raise ConfigError(f"{where}: unknown {name}{hint}")
+            raise ConfigError(f"{where}: unknown {short(str(name))}{hint}")
     return tuple(data)

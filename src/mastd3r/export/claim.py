@@ -4,7 +4,6 @@ An earlier run is replaced only by a complete one, or where the user says so."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from collections.abc import Sequence
@@ -12,7 +11,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import OutputError
+from ..errors import InputError, OutputError
+from ..reading.files import resolved, whole_json
 from .checkpoint import remove_checkpoints
 from .files import writing
 from .run_log import is_held
@@ -140,9 +140,9 @@ def check_ours(folder: Path) -> None:
 
 
 def refuse_inputs(folder: Path, inputs: Sequence[Path]) -> None:
-    out = folder.resolve()
+    out = resolved(folder)
     for given in inputs:
-        real = given.resolve()
+        real = resolved(given)
         if real == out or out in real.parents:
             raise OutputError(
                 f"{folder}: expected a folder without what is read, got one that holds {given}; {ANOTHER}"
@@ -183,8 +183,8 @@ def _left_at_once(path: Path) -> bool:
 def _record(folder: Path) -> dict[str, Any] | None:
     """run.json, if it is one of ours."""
     try:
-        record = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError, ValueError):
+        record = whole_json(folder / RECORD_FILE)
+    except InputError:
         return None
     is_ours = isinstance(record, dict) and all(isinstance(record.get(k), kind) for k, kind in RECORD.items())
     return record if is_ours else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -10,7 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ..errors import OutputError
+from ..errors import InputError, OutputError
+from ..reading.files import whole_json
 from .claim import ANOTHER, refuse_inputs
 from .files import write_json, writing
 
@@ -60,10 +60,10 @@ def _check(out: Path) -> None:
 def _files_of(out: Path) -> set[str]:
     """Files that an earlier export wrote; empty where there was none."""
     try:
-        record = json.loads((out / RECORD).read_text(encoding="utf-8"))
-    except (FileNotFoundError, ValueError):
+        record = whole_json(out / RECORD)
+    except InputError:
         return set()
-    if not isinstance(record, dict) or record.get("made_by") != MADE_BY or not isinstance(record.get("files"), list):
+    if record.get("made_by") != MADE_BY or not isinstance(record.get("files"), list):
         return set()
     return {RECORD, *map(str, record["files"])}
 

@@ -58,8 +58,12 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """``write_bytes`` in UTF-8."""
-    write_bytes(path, text.encode())
+    """``write_bytes`` in UTF-8; names that are none are written as the bytes that they are."""
+    try:
+        data = text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:
+        data = text.encode("utf-8", "backslashreplace")
+    write_bytes(path, data)
 
 
 def write_json(path: Path, data: dict[str, Any]) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.ply import read_ply, vertices_of
 from .files import write_bytes
-from .point_cloud import read_ply, vertex_colors, vertices_of
+from .point_cloud import finite_points, vertex_colors
 
 Array = NDArray[Any]
 VERTEX = np.dtype([(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")])
@@ -90,7 +91,7 @@ def read_mesh(path: Path) -> tuple[Array, Array, Array]:
     triangles = faces["vertices"]
     if (faces["count"] != 3).any() or (len(faces) and not 0 <= triangles.min() <= triangles.max() < len(rows)):
         raise InputError(f"{path}: expected triangles of its {len(rows)} vertices, got other faces")
-    return np.stack([rows[name] for name in "xyz"], -1).astype(np.float32), triangles, vertex_colors(rows)
+    return finite_points(rows, path), triangles, vertex_colors(rows)
 
 
 def glb_bytes(vertices_world: Array, faces: Array, colors: Array) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.ply import FARTHEST, read_vertices
 from ..types import StaticCloud
 from .files import write_bytes
 
@@ -28,11 +28,6 @@ VERTEX = np.dtype(
     ]
 )
 PLY_NAME = {"<f4": "float", "|u1": "uchar", "<i4": "int"}
-PLY_TYPE = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2",
-    "ushort": "<u2", "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4",
-    "float": "<f4", "float32": "<f4", "double": "<f8", "float64": "<f8",
-}  # fmt: skip
 
 
 def write_cloud(path: Path, cloud: StaticCloud) -> None:
@@ -60,8 +55,11 @@ def read_cloud(path: Path) -> StaticCloud:
     missing = [name for name in VERTEX.names or () if name not in (rows.dtype.names or ())]
     if missing:
         raise InputError(f"{path}: expected vertex properties {', '.join(missing)}, got {rows.dtype.names}")
+    unlike = [name for name in VERTEX.names or () if rows.dtype[name].kind != VERTEX[name].kind]
+    if unlike:
+        raise InputError(f"{path}: expected {unlike[0]} of type {PLY_NAME[VERTEX[unlike[0]].str]}, got another type")
     return StaticCloud(
-        _stacked(rows, "xyz"),
+        finite_points(rows, path),
         vertex_colors(rows),
         rows["confidence"].copy(),
         rows["spacing"].copy(),
@@ -74,7 +72,7 @@ def read_points(path: Path) -> Array:
     rows = read_vertices(path)
     if not set("xyz") <= set(rows.dtype.names or ()):
         raise InputError(f"{path}: expected vertex properties x, y, z, got {rows.dtype.names}")
-    return _stacked(rows, "xyz")
+    return finite_points(rows, path)
 
 
 def read_coloured_points(path: Path) -> tuple[Array, Array, Array | None]:
@@ -86,7 +84,7 @@ def read_coloured_points(path: Path) -> tuple[Array, Array, Array | None]:
     names = set(rows.dtype.names or ())
     if not set("xyz") <= names:
         raise InputError(f"{path}: expected vertex properties x, y, z, got {rows.dtype.names}")
-    return _stacked(rows, "xyz"), vertex_colors(rows), rows["spacing"].copy() if "spacing" in names else None
+    return finite_points(rows, path), vertex_colors(rows), rows["spacing"].copy() if "spacing" in names else None
 
 
 def vertex_colors(rows: Array) -> Array:
@@ -96,56 +94,10 @@ def vertex_colors(rows: Array) -> Array:
     return np.stack([rows[name] for name in ("red", "green", "blue")], -1).astype(np.uint8)
 
 
-def _stacked(rows: Array, names: str) -> Array:
-    return np.stack([rows[name] for name in names], -1).astype(np.float32)
-
-
-def read_vertices(path: Path) -> Array:
-    """The vertices of a little-endian PLY, (n,) structured by property name. Raises InputError."""
-    elements, body = read_ply(path)
-    if [e.name for e in elements] != ["vertex"]:
-        raise InputError(f"{path}: expected vertices only, got {', '.join(e.name for e in elements) or 'nothing'}")
-    return vertices_of(path, elements[0], body)
-
-
-@dataclass(frozen=True)
-class Element:
-    """What a PLY header says of one kind of rows."""
-
-    name: str
-    count: int
-    properties: tuple[tuple[str, ...], ...]  # words after "property"
-
-
-def read_ply(path: Path) -> tuple[list[Element], bytes]:
-    """The header of a little-endian PLY, and what follows it. Raises InputError."""
-    try:
-        data = path.read_bytes()
-    except OSError as e:
-        raise InputError(f"{path}: expected a readable PLY file, got {e.strerror or e}") from e
-    head, mark, body = data.partition(b"end_header\n")
-    lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    if not mark or lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]]:
-        raise InputError(f"{path}: expected a binary little-endian PLY, got {data[:40]!r}")
-    elements: list[Element] = []
-    for words in lines[2:]:
-        if words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
-            elements.append(Element(words[1], int(words[2]), ()))
-        elif words[:1] == ["property"] and len(words) > 2 and elements:
-            elements[-1] = replace(elements[-1], properties=(*elements[-1].properties, tuple(words[1:])))
-        elif words[:1] not in (["comment"], ["obj_info"], []):
-            raise InputError(f"{path}: expected elements and properties in the header, got {' '.join(words)[:60]!r}")
-    return elements, body
-
-
-def vertices_of(path: Path, element: Element, body: bytes) -> Array:
-    """The rows of an element of plain properties that ``body`` begins with, structured. Raises InputError."""
-    if any(len(p) != 2 or p[0] not in PLY_TYPE for p in element.properties):
-        raise InputError(f"{path}: expected vertices with plain properties only, got {element.properties}")
-    names = [name for _, name in element.properties]
-    if len(set(names)) < len(names):
-        raise InputError(f"{path}: expected every vertex property once, got {', '.join(names)}")
-    dtype = np.dtype([(name, PLY_TYPE[kind]) for kind, name in element.properties])
-    if len(body) < element.count * dtype.itemsize:
-        raise InputError(f"{path}: expected {element.count * dtype.itemsize} bytes of vertices, got {len(body)}")
-    return np.frombuffer(body, dtype, element.count)
+def finite_points(rows: Array, path: Path) -> Array:
+    """(n, 3) float32 positions of vertices. Raises InputError for one that is none."""
+    points = np.stack([rows[name] for name in "xyz"], -1)
+    wrong = np.flatnonzero(~(np.abs(points) < FARTHEST).all(-1))
+    if len(wrong):
+        raise InputError(f"{path} vertex {wrong[0]}: expected a position, got {points[wrong[0]].tolist()}")
+    return points.astype(np.float32)

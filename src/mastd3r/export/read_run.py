@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,13 +13,17 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..errors import InputError
+from ..reading.files import whole_bytes, whole_json, whole_text
+from ..reading.pictures import decoded
+from ..reading.yaml_text import MOST_YAML_BYTES
 from ..types import State, Trajectory
 from .claim import PICTURE
 from .run_folder import stamp
+from .run_record import checked_camera, checked_metrics, checked_record
 from .trajectory_files import read_tum
 
 Array = NDArray[Any]
-NOT_OF_THE_LENS = ("found", "focal_sigma_ratio")  # of camera.json
+LATEST_S = 1e12  # a time beyond is none
 
 
 @dataclass(frozen=True)
@@ -55,24 +59,24 @@ class Run:
 def read_run(path: Path | str) -> Run:
     """Load a run folder, complete or not. Raises InputError where run.json or trajectory.txt is missing."""
     folder = Path(path)
-    if not (folder / "run.json").is_file():
+    if not os.path.lexists(folder / "run.json"):
         raise InputError(f"{folder}: expected a run folder, got no run.json in it")
-    record = read_json(folder / "run.json")
-    trajectory = read_tum(folder / "trajectory.txt")
-    if (folder / "keyframes.txt").is_file():
+    record = checked_record(read_json(folder / "run.json"), folder / "run.json")
+    trajectory = _poses(folder / "trajectory.txt")
+    if os.path.lexists(folder / "keyframes.txt"):
         times = {stamp(float(t)) for t in read_tum(folder / "keyframes.txt").timestamps_s}
         is_keyframe = np.array([stamp(float(t)) in times for t in trajectory.timestamps_s], bool)
         trajectory = replace(trajectory, is_keyframe=is_keyframe)
     if "states" in record:
         trajectory = replace(trajectory, states=_states(record["states"], trajectory, folder))
     camera_file, config_file = folder / "camera.json", folder / "config.yaml"
-    camera, distortion = _camera(camera_file) if camera_file.is_file() else (None, ())
+    camera, distortion = checked_camera(camera_file) if os.path.lexists(camera_file) else (None, ())
     return Run(
         path=folder,
         trajectory=trajectory,
         record=record,
-        metrics=read_json(folder / "metrics.json") if (folder / "metrics.json").is_file() else {},
-        config=config_file.read_text() if config_file.is_file() else "",
+        metrics=checked_metrics(folder / "metrics.json"),
+        config=whole_text(config_file, "readable YAML", most=MOST_YAML_BYTES) if os.path.lexists(config_file) else "",
         camera=camera,
         distortion=distortion,
     )
@@ -80,37 +84,26 @@ def read_run(path: Path | str) -> Run:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON object. Raises InputError."""
-    try:
-        data = json.loads(path.read_text())
-    except (OSError, ValueError) as e:
-        raise InputError(f"{path}: expected readable JSON, got {e}") from e
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object, got {type(data).__name__}")
-    return data
+    return whole_json(path)
+
+
+def _poses(path: Path) -> Trajectory:
+    """The poses of a run, every one finite, each with a time of its own. Raises InputError."""
+    trajectory = read_tum(path)
+    times_s, poses = trajectory.timestamps_s, trajectory.world_from_cam
+    wrong = ~(np.isfinite(poses).all((1, 2)) & (np.abs(times_s) < LATEST_S))
+    wrong[1:] |= np.diff(times_s) <= 0
+    if wrong.any():
+        n = int(np.argmax(wrong))
+        raise InputError(f"{path}: expected finite poses, each at a time of its own, got another at {times_s[n]} s")
+    return trajectory
 
 
 def _states(runs: Any, trajectory: Trajectory, folder: Path) -> tuple[State, ...]:
-    try:
-        states: tuple[State, ...] = tuple(state for state, count in runs for _ in range(count))
-    except (TypeError, ValueError) as e:
-        raise InputError(f"{folder}/run.json: expected states as [state, count] pairs, got {str(runs)[:60]}") from e
-    if not set(states) <= set(get_args(State)):
-        raise InputError(f"{folder}/run.json: expected states {', '.join(get_args(State))}, got {set(states)}")
-    if len(states) != len(trajectory.timestamps_s):
-        raise InputError(
-            f"{folder}/run.json: expected states of {len(trajectory.timestamps_s)} poses, got {len(states)}"
-        )
-    return states
-
-
-def _camera(path: Path) -> tuple[Camera, tuple[float, ...]]:
-    """The camera and its whole distortion; empty where camera.json has no such list."""
-    data = read_json(path)
-    try:
-        distortion = tuple(float(v) for v in data.pop("distortion", []))
-        return Camera(**{k: v for k, v in data.items() if k not in NOT_OF_THE_LENS}), distortion
-    except (TypeError, ValueError) as e:
-        raise InputError(f"{path}: expected the fields of a camera, got {e}") from e
+    poses, told = len(trajectory.timestamps_s), sum(count for _, count in runs)
+    if told != poses:
+        raise InputError(f"{folder}/run.json: expected states of {poses} poses, got {told}")
+    return tuple(state for state, count in runs for _ in range(count))
 
 
 def _times(folder: Path) -> Array:
@@ -118,11 +111,4 @@ def _times(folder: Path) -> Array:
 
 
 def _read_image(path: Path, mode: int) -> Array:
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as e:
-        raise InputError(f"{path}: expected a readable image, got {e.strerror or e}") from e
-    image = cv2.imdecode(data, mode) if data.size else None
-    if image is None:
-        raise InputError(f"{path}: expected an image, got {data.size} bytes that are not one")
-    return np.asarray(image)
+    return np.asarray(decoded(whole_bytes(path, "a readable image"), path, mode))

@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from ..errors import ConfigError, InputError
 from ..geometry.quaternion import quaternion_from_rotation, rotation_from_quaternion
+from ..reading.files import whole_text
 from ..types import State, Trajectory
 from .files import write_text
 
 Array = NDArray[Any]
 TrajectoryKind = Literal["tum", "kitti", "euroc"]
+FARTHEST = 1e9  # map units or metres; a number beyond is no position
 NOT_A_ROTATION = 0.01  # largest entry of R^T R - 1 that rounding in a file may leave
+SHORTEST = 1e-6  # quaternion
 HEADER = "# timestamp_s tx ty tz qx qy qz qw (world_from_cam)\n"
 
 
@@ -43,7 +46,7 @@ def read_tum(path: Path, state: State = "tracked") -> Trajectory:
             raise InputError(f"{path} line {number}: expected t tx ty tz qx qy qz qw, got {line[:60]!r}")
         rows.append(row)
     data = np.array(rows, float).reshape(-1, 8)
-    return _in_order(data[:, 0], data[:, 1:4], rotation_from_quaternion(data[:, [7, 4, 5, 6]]), state)
+    return _in_order(data[:, 0], data[:, 1:4], _rotations(data[:, [7, 4, 5, 6]]), state)
 
 
 def read_trajectory(path: Path, kind: str, times_s: Array) -> Trajectory:
@@ -80,7 +83,8 @@ def _read_kitti(path: Path, times_s: Array) -> Trajectory:
         if len(row) != 12:
             raise InputError(f"{path} line {number}: expected the 12 numbers of a KITTI pose, got {len(row)}")
         turn = np.array(row).reshape(3, 4)[:, :3]
-        if not np.abs(turn.T @ turn - np.eye(3)).max() < NOT_A_ROTATION:
+        sound = bool((np.abs(turn) < 2).all())  # NaN is not
+        if not sound or np.abs(turn.T @ turn - np.eye(3)).max() >= NOT_A_ROTATION:
             raise InputError(f"{path} line {number}: expected a rotation and a position, got {line[:60]!r}")
         rows.append(row)
     if len(rows) != len(times_s):
@@ -99,28 +103,35 @@ def _read_euroc(path: Path) -> Trajectory:
             raise InputError(f"{path} line {number}: expected t_ns,x,y,z,qw,qx,qy,qz, got {line[:60]!r}")
         rows.append(row[:8])
     data = np.array(rows, float).reshape(-1, 8)
-    return _in_order(data[:, 0] * 1e-9, data[:, 1:4], rotation_from_quaternion(data[:, 4:]), "tracked")
+    return _in_order(data[:, 0] * 1e-9, data[:, 1:4], _rotations(data[:, 4:]), "tracked")
+
+
+def _rotations(wxyz: Array) -> Array:
+    """(n, 4) to (n, 3, 3); NaN where a quaternion has no length that a file could mean."""
+    length = np.abs(wxyz).max(1, initial=0.0)
+    sound = (length > SHORTEST) & (length < 1 / SHORTEST)
+    out = np.full((len(wxyz), 3, 3), np.nan)
+    out[sound] = rotation_from_quaternion(wxyz[sound])
+    return out
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """(number from 1, text) of every line that is neither empty nor a comment."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: expected a readable trajectory file, got {e}") from e
+    lines = whole_text(path, "a readable trajectory file").splitlines()
     return [(n, line) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
 
 
 def _floats(path: Path, number: int, line: str, words: list[str]) -> list[float]:
     try:
         return [float(word) for word in words]
-    except ValueError as e:
+    except (ValueError, OverflowError) as e:
         raise InputError(f"{path} line {number}: expected numbers, got {line[:60]!r}") from e
 
 
 def _in_order(times_s: Array, positions: Array, rotations: Array, state: State) -> Trajectory:
-    """Poses (n, 4, 4) of their parts, in order of time; no keyframe among them."""
+    """Poses (n, 4, 4) of their parts, in order of time; no keyframe among them. What is no pose becomes NaN."""
     order = np.argsort(times_s, kind="stable")
     poses = np.tile(np.eye(4), (len(order), 1, 1))
     poses[:, :3, 3], poses[:, :3, :3] = positions[order], rotations[order]
+    poses[~(np.abs(poses) < FARTHEST).all((1, 2))] = np.nan
     return Trajectory(times_s[order], poses, (state,) * len(order), np.zeros(len(order), bool))

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, OutputError
+from ..reading.ply import FARTHEST, read_vertices
 from .gaussian_arrays import GaussianArrays
 
 SH_DC = 0.28209479177387814  # first spherical harmonic
 _OF_REST = {0: 0, 9: 3, 24: 8, 45: 15}  # number of f_rest columns -> upper coefficients a channel
+MOST_LOG_SCALE, SHORTEST = 40.0, 1e-6  # of what a splat may say
 _OPACITY_EDGE = 1e-6  # logits stay finite
 
 
@@ -52,24 +54,27 @@ def write_gaussians_ply(path: Path, gaussians: GaussianArrays) -> None:
         raise OutputError(f"{path}: expected to write {table.nbytes} bytes, got {e}") from e
 
 
+def _check_numbers(table: np.ndarray, path: Path) -> None:
+    """Raise InputError for Gaussians that cannot be drawn."""
+    for name in table.dtype.names or ():
+        most = MOST_LOG_SCALE if name.startswith("scale_") else FARTHEST
+        wrong = np.flatnonzero(~(np.abs(table[name]) < most))
+        if len(wrong):
+            n = int(wrong[0])
+            raise InputError(f"{path} vertex {n}: expected {name} within {most:g}, got {table[name][n]:g}")
+    turns = np.stack([table[f"rot_{i}"] for i in range(4)], 1)
+    if len(turns) and not np.abs(turns).max(1).min() > SHORTEST:
+        raise InputError(f"{path}: expected rotations, got a quaternion of length 0")
+
+
 def read_gaussians_ply(path: Path) -> GaussianArrays:
     """What ``write_gaussians_ply`` wrote; ``kf_id`` is not in the file and becomes -1. Raises InputError."""
-    try:
-        data = path.read_bytes()
-    except OSError as e:
-        raise InputError(f"{path}: expected a readable .ply, got {e}") from e
-    head, mark, body = data.partition(b"end_header\n")
-    lines = head.decode("ascii", "replace").split("\n")
-    words = [line.split() for line in lines]
-    counts = [int(w[2]) for w in words if w[:2] == ["element", "vertex"] and len(w) == 3 and w[2].isdecimal()]
-    names = tuple(w[2] for w in words if w[:2] == ["property", "float"] and len(w) == 3)
+    table = read_vertices(path)
+    names = table.dtype.names or ()
     rest = sum(name.startswith("f_rest_") for name in names)
-    known = rest in _OF_REST and names == _names(rest)
-    if not mark or "format binary_little_endian 1.0" not in lines or len(counts) != 1 or not known:
+    if rest not in _OF_REST or table.dtype != np.dtype([(name, "<f4") for name in _names(rest)]):
         raise InputError(f"{path}: expected a binary 3-D Gaussian .ply, got another layout")
-    if len(body) != counts[0] * 4 * len(names):
-        raise InputError(f"{path}: expected {counts[0]} Gaussians, got {len(body)} bytes of data")
-    table = np.frombuffer(body, [(name, "<f4") for name in names])
+    _check_numbers(table, path)
 
     def columns(*wanted: str) -> np.ndarray:
         return np.stack([table[name] for name in wanted], 1) if wanted else np.zeros((len(table), 0), np.float32)

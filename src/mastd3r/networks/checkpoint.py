@@ -22,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from ..errors import InputError, MissingPackage
+from ..reading.files import check_plain
 from .mast3r import Mast3r, Mast3rConfig
 
 ARCHIVE_MAGIC = b"PK\x03\x04"
@@ -125,6 +126,7 @@ def _listed(what: str, names: list[str], between: str = ", ") -> str:
 
 def _kind(path: Path) -> str:
     """ "archive" or "safetensors" by the first bytes."""
+    check_plain(path, "weights", CheckpointError)
     try:
         with path.open("rb") as file:
             head = file.read(9)
@@ -170,6 +172,10 @@ def _read_archive(path: Path) -> dict[str, Tensor]:
     """The entry "model" of a torch archive, or the archive itself where it is a plain state."""
     try:
         with zipfile.ZipFile(path) as archive:
+            if sum(i.file_size for i in archive.infolist()) > path.stat().st_size:
+                raise CheckpointError(
+                    f"weights {path}: expected parts as they are, as torch writes them, got packed ones"
+                )
             damaged = archive.testzip()  # torch does not compare checksums
     except UNREADABLE as e:
         raise CheckpointError(f"weights {path}: expected a whole torch archive, got {_one_line(e)}") from e

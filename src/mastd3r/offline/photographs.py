@@ -19,6 +19,7 @@ from ..export.files import write_bytes, writing
 from ..export.frame_names import names_below, video_frame_name
 from ..export.read_run import Run
 from ..export.run_folder import stamp
+from ..reading.files import whole_bytes
 from ..sources.image_files import stored_as_read
 from ..types import Source, Trajectory
 
@@ -75,7 +76,7 @@ class _Names:
 
     def __init__(self, run: Run, source: Source) -> None:
         self.files: dict[int, Path] = getattr(source, "files", {})
-        self._by_time = run.record.get("files", {})
+        self._by_time = run.record.get("files") or {}
         self._by_index = names_below(self.files)
         self._told = False
         if "files" not in run.record:
@@ -111,7 +112,4 @@ def write_photograph(path: Path, image: Array, file: Path | None = None) -> None
 
 
 def _bytes_of(file: Path) -> bytes:
-    try:
-        return file.read_bytes()
-    except OSError as e:
-        raise InputError(f"{file}: expected a readable image, got {e.strerror or e}") from e
+    return whole_bytes(file, "a readable image")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -10,13 +11,12 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
 from ..concurrency import one_blas_thread
-from ..config import Config, MapQualityKind, config_from_dict
+from ..config import Config, MapQualityKind, config_from_text
 from ..errors import ConfigError, InputError
 from ..evaluation.cloud_error import evaluate_cloud
 from ..evaluation.evaluate import evaluate
@@ -30,6 +30,7 @@ from ..export.run_folder import RunFolder
 from ..mapping.gaussians import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
 from ..progress import Reporter, Silent
+from ..reading.files import is_file, user_path
 from ..sources import open_source
 from ..types import StaticCloud
 from .continued_map import continue_map
@@ -122,7 +123,7 @@ class Reconstruction:
     def gaussians(self) -> GaussianArrays | None:
         """The splat; None where none was made."""
         file = self.path / "gaussians.ply"
-        return read_gaussians_ply(file) if file.is_file() else None
+        return read_gaussians_ply(file) if os.path.lexists(file) else None
 
     @property
     def metrics(self) -> dict[str, Any]:
@@ -156,11 +157,7 @@ class Reconstruction:
     @property
     def config(self) -> Config:
         """The options that it was made with. Raises ConfigError for a config.yaml that nobody can read."""
-        try:
-            data = yaml.safe_load(self._run.config) or {}
-        except yaml.YAMLError as e:
-            raise ConfigError(f"{self.path}/config.yaml: expected readable YAML, got {' '.join(str(e).split())}") from e
-        return config_from_dict(data)
+        return config_from_text(self._run.config, f"{self.path}/config.yaml")
 
     def evaluate(self, sequence: str | Path) -> dict[str, Any]:
         """Figures against a sequence with truth, as metrics.json says them from here on; as ``mastd3r eval``.
@@ -176,7 +173,7 @@ class Reconstruction:
 
     def _cloud_error(self, sequence: str | Path) -> dict[str, Any]:
         """How far the cloud, the dense one where there is one, is from what a sequence's depth sensor saw."""
-        file = next((f for f in (self.path / CLOUD_FILE, self.path / "cloud.ply") if f.is_file()), None)
+        file = next((f for f in (self.path / CLOUD_FILE, self.path / "cloud.ply") if is_file(f)), None)
         lens = self._run.camera
         source = open_source(sequence, self.config.source, want_depth=True)
         if file is None or lens is None or not source.has_depth:
@@ -217,8 +214,8 @@ class Reconstruction:
     def _photographs(self, source: str | Path | None) -> Path:
         """Where the photographs of the run are."""
         said = source if source is not None else (self._run.record.get("source") or {}).get("path", "")
-        path = Path(said).expanduser()
-        if source is None and (not said or not path.exists()):
+        path = user_path(said or ".", f"{self.path}/run.json source.path" if source is None else "--source")
+        if source is None and (not said or not os.path.exists(path)):
             raise InputError(
                 f"{self.path}/run.json: expected the photographs at its source.path, got no such path as "
                 f"{str(said)!r}; say with --source where they are"
@@ -230,7 +227,7 @@ class Reconstruction:
 
         Raises OutputError where that is not ours to write.
         """
-        target = Path(path).expanduser()
+        target = user_path(path)
         if target.resolve() == self.path.resolve():
             return self.path
         where = claim(target, [self.path])
@@ -258,7 +255,7 @@ class Reconstruction:
         Raises ConfigError for a format or an option that is not known, InputError for one that the run has nothing for,
         and OutputError.
         """
-        out = Path(out).expanduser()
+        out = user_path(out, "out")
         _check_export(kind, source, undistort, all_poses)
         if kind in SPLATS:
             return export_splat(self._run, kind, out, all_poses=all_poses)

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from ..camera.map_view import MapView
 from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
-from ..config import Config, config_from_dict
+from ..config import config_from_text
 from ..errors import InputError
 from ..export.export_folder import export_folder
 from ..export.files import replacing, writing
@@ -97,7 +96,7 @@ def export_splat(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> 
             write_flight(part, splat.render, flight_camera(lens), poses)
         return out
     trajectory, per_unit = exported_poses(run, all_poses), depth_png_per_unit(median_depth)
-    mapping = (config_from_dict(yaml.safe_load(run.config) or {}) if run.config else Config()).mapping
+    mapping = config_from_text(run.config, f"{run.path}/config.yaml").mapping
     map_view = MapView(lens, mapping.width_px, mapping.tau_uncertainty_px)
     facts = {"kind": kind, "run": str(run.path.resolve()), "depth_png_per_unit": per_unit}
     with export_folder(out, facts, []) as staged:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ..errors import InputError
+from ..reading.pictures import BROKEN, opened
 from .grey_levels import spread
-from .image_files import BROKEN
 
 WORDS = {
     *("mask", "masks", "m", "seg", "segm", "segmentation", "label", "labels", "labelids", "semantic", "instance"),
@@ -77,12 +78,12 @@ def _no_photographs(kind: str, pairs: list[tuple[Path, Path]]) -> bool:
 
 def _is_no_photograph(path: Path, frame: Path, named: bool) -> bool:
     try:
-        with Image.open(path) as image, Image.open(frame) as photograph:
+        with opened(path) as image, opened(frame) as photograph:
             deep, colour = image.mode.startswith(("I", "F")), photograph.mode not in GREY
             if colour and (deep or (named and image.mode in (*GREY, "P"))):
                 return True
             return _has_few_values(image) and not _has_few_values(photograph)
-    except BROKEN:
+    except (InputError, *BROKEN):
         return False  # who reads it as an image says what is wrong with it
 
 

@@ -85,7 +85,7 @@ class BonnSource(TumSource):
             lens_size=SIZE,
             found=found,
         )
-        self._notes.put("truth", "groundtruth.txt is of the markers: moved to the camera by the published T_ros, T_m")
+        self._notes.put("markers", "groundtruth.txt is of the markers: moved to the camera by the published T_ros, T_m")
         if self.has_depth:
             self._notes.put("metre", "depth as it is stored; its metre is 1.059 of the laser model's, as T_m tells")
 

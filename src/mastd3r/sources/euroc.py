@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from .sequence import Listed, Sequenced, check_times, read_lines, read_numbers, rigid
+from ..reading.files import short, whole_text
+from ..reading.yaml_text import MOST_YAML_BYTES, yaml_value
+from .sequence import Listed, Sequenced, check_times, read_lines, read_numbers, rigid, truth_or_note
 
 Array = NDArray[Any]
 KIND = "euroc"
@@ -40,13 +41,8 @@ def find(folder: Path) -> Sequenced:
     sensor = _sensor(cam / "sensor.yaml")
     body_from_cam = rigid(_values(sensor, "T_BS", 16, cam / "sensor.yaml").reshape(4, 4), f"{cam / 'sensor.yaml'} T_BS")
     resolution = _values(sensor, "resolution", 2, cam / "sensor.yaml")
-    times, poses = np.empty(0), np.empty((0, 4, 4))
-    notes = [f"no {TRUTH}/data.csv: no poses"]
-    file = inner / TRUTH / "data.csv"
-    if file.is_file():
-        times, world_from_body = _body_poses(file)
-        poses = world_from_body @ body_from_cam
-        notes = [f"{len(poses)} poses of {TRUTH}, moved from the body to cam0 by T_BS"]
+    notes: list[str] = []
+    times, poses = truth_or_note(lambda: _truth(inner / TRUTH / "data.csv", body_from_cam, notes), notes)
     here = folder.resolve()
     return Sequenced(
         KIND,
@@ -59,6 +55,15 @@ def find(folder: Path) -> Sequenced:
         (int(resolution[0]), int(resolution[1])),
         notes=notes,
     )
+
+
+def _truth(file: Path, body_from_cam: Array, notes: list[str]) -> tuple[Array, Array]:
+    if not file.is_file():
+        notes.append(f"no {TRUTH}/data.csv: no poses")
+        return np.empty(0), np.empty((0, 4, 4))
+    times, world_from_body = _body_poses(file)
+    notes.append(f"{len(times)} poses of {TRUTH}, moved from the body to cam0 by T_BS")
+    return times, world_from_body @ body_from_cam
 
 
 def _inner(folder: Path) -> Path:
@@ -92,12 +97,8 @@ def _body_poses(path: Path) -> tuple[Array, Array]:
 
 
 def _sensor(path: Path) -> dict[str, Any]:
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as e:
-        raise InputError(f"{path}: expected the camera's calibration, got no such file") from e
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as e:
-        raise InputError(f"{path}: expected readable YAML, got {' '.join(str(e).split())}") from e
+    text = whole_text(path, "the camera's calibration", most=MOST_YAML_BYTES)
+    data = yaml_value(text, str(path), InputError)
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected key: value pairs, got {type(data).__name__}")
     return data
@@ -108,16 +109,16 @@ def _values(sensor: dict[str, Any], key: str, count: int, path: Path) -> Array:
     numbers = value.get("data") if isinstance(value, dict) else value
     try:
         array = np.array(numbers, float).ravel()
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.empty(0)
     if len(array) != count or not np.isfinite(array).all():
-        raise InputError(f"{path}: expected {key} of {count} numbers, got {numbers!r}")
+        raise InputError(f"{path}: expected {key} of {count} numbers, got {short(repr(numbers))}")
     return array
 
 
 def _lens(sensor: dict[str, Any], path: Path) -> tuple[float, ...]:
     for key, expected in LENS_KEYS.items():
         if sensor.get(key) != expected:
-            raise InputError(f"{path}: expected {key} {expected}, got {sensor.get(key)!r}")
+            raise InputError(f"{path}: expected {key} {expected}, got {short(repr(sensor.get(key)))}")
     intrinsics = _values(sensor, "intrinsics", 4, path)
     return (*map(float, intrinsics), *map(float, _values(sensor, "distortion_coefficients", 4, path)))

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
+from ..errors import InputError
+from ..reading.pictures import BROKEN, opened
 from .grey_levels import spread
-from .image_files import BROKEN
 
 FILM_DIAGONAL_MM = float(np.hypot(36.0, 24.0))  # CIPA DCG-001: equivalents are of the same angle across the diagonal
 LOOKED_AT = 200  # files
@@ -44,11 +44,11 @@ def focal_of_file(path: Path, size: tuple[int, int]) -> tuple[float, str] | None
     unit of the sensor, scaled from the size that the camera wrote to that of the file.
     """
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             if image.format == "PNG" and "exif" not in image.info:
                 return None  # Pillow would decode the image to look behind it
             exif = image.getexif().get_ifd(EXIF_IFD)
-    except BROKEN:
+    except (InputError, *BROKEN):
         return None
     sides, written = sorted(size), sorted(_number(exif.get(tag)) for tag in (PIXELS_X, PIXELS_Y))
     if written[0] > 0 and abs((sides[1] / sides[0]) / (written[1] / written[0]) - 1) > ASPECT_RATIO:

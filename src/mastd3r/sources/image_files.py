@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +10,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ..errors import InputError
+from ..reading.arrays import BrokenArray, array_of
+from ..reading.pictures import BROKEN, opened
 from .grey_levels import TOP, WHOLE, GreyRange
 
 Array = NDArray[Any]
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 EXIF_ORIENTATION, UPRIGHT = 0x0112, 1
 MAP_SUFFIXES = (".png", ".npy")
-BROKEN = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error, Image.DecompressionBombError)
 
 
 class BrokenFile(InputError):
@@ -39,7 +38,7 @@ def read_rgb(path: Path, grey_range: GreyRange = WHOLE) -> Array:
 def stored_as_read(path: Path) -> bool:
     """True where ``read_rgb`` changes nothing: 8-bit colour or grey, stored upright. Raises InputError."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             return image.mode in ("L", "RGB") and image.getexif().get(EXIF_ORIENTATION, UPRIGHT) == UPRIGHT
     except BROKEN as e:
         raise BrokenFile(f"{path}: expected a readable image, got a broken or unknown file ({e})") from e
@@ -48,7 +47,7 @@ def stored_as_read(path: Path) -> bool:
 def read_grey_levels(path: Path) -> Array | None:
     """(h, w) levels of a 16-bit grey file; None for another kind of image, which is not read, or a broken one."""
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             if not image.mode.startswith("I"):
                 return None
         return _grey_levels(_opened(path, "a readable image"), path)
@@ -92,7 +91,7 @@ def read_probability(path: Path) -> Array:
 
 def _opened(path: Path, expected: str) -> Image.Image:
     try:
-        with Image.open(path) as image:
+        with opened(path) as image:
             image.load()
             return ImageOps.exif_transpose(image)
     except FileNotFoundError as e:
@@ -113,11 +112,9 @@ def _map_values(path: Path, expected: str) -> Array:
     """One number a pixel, as stored, (h, w)."""
     if path.suffix.lower() == ".npy":
         try:
-            values: Array = np.load(path, allow_pickle=False)
-        except FileNotFoundError as e:
-            raise InputError(f"{path}: expected {expected}, got no such file") from e
-        except (OSError, ValueError, EOFError) as e:
-            raise BrokenFile(f"{path}: expected {expected} as .npy, got a broken file ({e})") from e
+            values: Array = array_of(path, expected)
+        except BrokenArray as e:
+            raise BrokenFile(str(e)) from e
     else:
         image = _opened(path, expected)
         values = np.asarray(image.convert("L") if image.mode in ("P", "LA", "RGB", "RGBA") else image)

@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import entries_of, is_file
 from ..types import Frame, Truth
 from .beside import beside_frames
 from .checks import window
 from .exif_focal import focal_of
 from .image_files import IMAGE_SUFFIXES, read_probability
 from .notes import Notes
-from .photographs import Photographs
+from .photographs import BrokenBeside, Photographs
 from .semantic_maps import match_maps
 
 Array = NDArray[Any]
@@ -35,7 +36,9 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 def image_files(folder: Path) -> list[Path]:
     """The image files right in ``folder``, hidden ones left out, in natural order."""
     found = [
-        p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and p.is_file()
+        p
+        for p in entries_of(folder)
+        if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".") and is_file(p)
     ]
     return sorted(found, key=lambda p: (natural_key(p.name), p.name))
 
@@ -79,11 +82,12 @@ class ImageFolderSource:
 
     def frames(self) -> Iterator[Frame]:
         """One image after another, broken ones left out and noted. Raises InputError where the size changes."""
-        given = 0
+        given, broken_maps = 0, BrokenBeside(self._notes, "maps")
         for i, image in self._photographs.images():
             semantic = None
             if self._want_semantic and i in self._semantic:
-                semantic = read_probability(self._semantic[i])
+                with broken_maps.noted(self._semantic[i]):
+                    semantic = read_probability(self._semantic[i])
             given += 1
             yield Frame(i, i / FOLDER_FPS, image, semantic=semantic)
         self.length = given

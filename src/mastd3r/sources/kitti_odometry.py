@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.se3 import inverse
-from .sequence import Listed, Sequenced, numbered, read_keyed, read_numbers, rigid_all, without_gaps
+from .sequence import Listed, Sequenced, numbered, read_keyed, read_numbers, rigid_all, truth_or_note, without_gaps
 
 Array = NDArray[Any]
 KIND = "kitti-odometry"
@@ -41,26 +41,30 @@ def find(folder: Path) -> Sequenced:
     times = read_numbers(folder / "times.txt", 1, "a time in seconds")[:, 0]
     images = without_gaps(numbered(folder / f"image_{camera}", "", ".png", "images"), len(times), "images", folder)
     projection = read_keyed(folder / "calib.txt", {f"P{camera}": 12})[f"P{camera}"].reshape(3, 4)
-    poses, notes = np.empty((0, 4, 4)), []
-    file = _pose_file(folder)
-    if file is None:
-        notes.append(f"no poses: {folder.resolve().name}.txt is neither in ../../poses nor in the folder")
-    else:
-        world_from_grey = rigid_all(read_numbers(file, 12, "a (3, 4) matrix"), file)
-        if len(world_from_grey) != len(times):
-            raise InputError(f"{file}: expected {len(times)} poses as times.txt has times, got {len(world_from_grey)}")
-        poses = world_from_grey @ inverse(camera_from_rectified(projection))
-        notes.append(f"poses of {file.name}, moved from the left grey camera to image_{camera}")
+    notes: list[str] = []
+    true_times, poses = truth_or_note(lambda: _truth(folder, times, projection, camera, notes), notes)
     return Sequenced(
         KIND,
         folder.resolve().name,
         [Listed(float(t), image) for t, image in zip(times, images, strict=True)],
         f"image_{camera} ({what}), times.txt; lens of P{camera} in calib.txt",
-        times if len(poses) else np.empty(0),
+        true_times,
         poses,
         intrinsics_of(projection),
         notes=notes,
     )
+
+
+def _truth(folder: Path, times: Array, projection: Array, camera: int, notes: list[str]) -> tuple[Array, Array]:
+    file = _pose_file(folder)
+    if file is None:
+        notes.append(f"no poses: {folder.resolve().name}.txt is neither in ../../poses nor in the folder")
+        return np.empty(0), np.empty((0, 4, 4))
+    world_from_grey = rigid_all(read_numbers(file, 12, "a (3, 4) matrix"), file)
+    if len(world_from_grey) != len(times):
+        raise InputError(f"{file}: expected {len(times)} poses as times.txt has times, got {len(world_from_grey)}")
+    notes.append(f"poses of {file.name}, moved from the left grey camera to image_{camera}")
+    return times, world_from_grey @ inverse(camera_from_rectified(projection))
 
 
 def camera_from_rectified(projection: Array) -> Array:

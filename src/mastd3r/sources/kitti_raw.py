@@ -19,7 +19,17 @@ from scipy.spatial.transform import Rotation
 from ..errors import InputError
 from ..geometry.se3 import inverse
 from .kitti_odometry import camera_from_rectified, intrinsics_of
-from .sequence import Listed, Sequenced, numbered, read_keyed, read_lines, read_numbers, rigid, without_gaps
+from .sequence import (
+    Listed,
+    Sequenced,
+    numbered,
+    read_keyed,
+    read_lines,
+    read_numbers,
+    rigid,
+    truth_or_note,
+    without_gaps,
+)
 
 Array = NDArray[Any]
 KIND = "kitti-raw"
@@ -55,23 +65,31 @@ def find(folder: Path) -> Sequenced:
         line = f"no calibration: {CALIBRATION[0]} is neither beside the drive nor in it; so neither poses nor lens"
         return Sequenced(KIND, folder.resolve().name, frames, found, notes=[line])
     projection, cam_from_imu, size = _cam_from_imu(calibration, camera)
-    poses, notes = np.empty((0, 4, 4)), ["no oxts/data: no poses"]
-    if (folder / "oxts" / "data").is_dir():
-        packets = numbered(folder / "oxts" / "data", "", ".txt", "packets")
-        poses = world_from_imu(_packets(without_gaps(packets, len(times), "packets", folder / "oxts" / "data")))
-        poses = poses @ np.linalg.inv(cam_from_imu)  # of printed rotations, so not their transpose
-        notes = [f"poses from {len(poses)} packets of oxts through {', '.join(CALIBRATION)}"]
+    notes: list[str] = []
+    true_times, poses = truth_or_note(lambda: _truth(folder / "oxts" / "data", times, cam_from_imu, notes), notes)
     return Sequenced(
         KIND,
         folder.resolve().name,
         frames,
         f"{found}; lens of P_rect_{camera} in {CALIBRATION[0]}",
-        times if len(poses) else np.empty(0),
+        true_times,
         poses,
         intrinsics_of(projection),
         size,
         notes=notes,
     )
+
+
+def _truth(packets: Path, times: Array, cam_from_imu: Array, notes: list[str]) -> tuple[Array, Array]:
+    if not packets.is_dir():
+        notes.append("no oxts/data: no poses")
+        return np.empty(0), np.empty((0, 4, 4))
+    files = without_gaps(numbered(packets, "", ".txt", "packets"), len(times), "packets", packets)
+    poses = world_from_imu(_packets(files)) @ np.linalg.inv(cam_from_imu)  # of printed rotations: not their transpose
+    if not np.isfinite(poses).all():
+        raise InputError(f"{packets}: expected latitudes and angles, got numbers that are none")
+    notes.append(f"poses from {len(poses)} packets of oxts through {', '.join(CALIBRATION)}")
+    return times, poses
 
 
 def read_times(path: Path) -> Array:

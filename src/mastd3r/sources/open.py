@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import entries_of, is_file, user_path
 from ..types import Source
 from . import bonn, euroc, kitti_odometry, kitti_raw, replica, seven_scenes, tum_rgbd
 from .bonn import BonnSource
@@ -78,18 +79,18 @@ def open_source(
     wanted is not read. ``semantic_dir`` holds the user's own maps and goes before those of the folder.
     Raises InputError (missing, empty, unreadable, unknown or ambiguous kind) and ConfigError (window out of range).
     """
-    path = Path(path).expanduser()
+    path = user_path(path)
     wants = Wants(want_depth, want_semantic, semantic_dir)
-    if not path.exists():
+    if not os.path.exists(path):
         raise InputError(f"{path}: expected a video or a folder of images, got no such path")
-    if path.is_file():
+    if is_file(path):
         if config.kind not in ("auto", "video"):
             raise InputError(f"{path}: expected a folder, as --kind {config.kind} says, got a file")
         from .video import VideoSource  # brings PyAV, which folders do not need
 
         return VideoSource(path, config, want_semantic=want_semantic, semantic_dir=semantic_dir)
     if not path.is_dir():
-        raise InputError(f"{path}: expected a file or a folder, got something else")
+        raise InputError(f"{path}: expected a file or a folder, got a named pipe, a socket or a device")
     if config.kind == "video":
         raise InputError(f"{path}: expected a video file, as --kind video says, got a folder")
     if config.kind == "images":
@@ -118,7 +119,7 @@ def _refuse_without_images(folder: Path) -> None:
     """Raise InputError where a folder has no images, and say where images or sequences may be instead."""
     if image_files(folder):
         return
-    entries = sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+    entries = [p for p in entries_of(folder) if not p.name.startswith(".")]
     if not entries:
         raise InputError(f"{folder}: expected images or a TUM layout, got an empty folder")
     inside = [p.relative_to(folder).as_posix() for p in _sequences_in(folder)]
@@ -128,7 +129,7 @@ def _refuse_without_images(folder: Path) -> None:
             f"{folder}: expected one sequence, got a folder that holds {len(inside)}; name one of them: "
             f"{', '.join(inside[:SHOWN])}{more}"
         )
-    inner = next((p for p in entries if p.is_dir() and image_files(p)), None)
+    inner = next((p for p in entries if _can_be_listed(p) and image_files(p)), None)
     hint = f"; its folder {inner.name} has images" if inner else ""
     raise InputError(
         f"{folder}: expected {IMAGES}, or {'; '.join(layout.expected for layout in LAYOUTS)}; "
@@ -136,13 +137,17 @@ def _refuse_without_images(folder: Path) -> None:
     )
 
 
+def _can_be_listed(path: Path) -> bool:
+    return os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK)
+
+
 def _sequences_in(folder: Path) -> list[Path]:
     """Folders inside that one of the layouts fits, nearest first; no more than ``LOOKED_AT`` folders are looked at."""
     found: list[Path] = []
     level, looked_at = [folder], 0
     for _ in range(DEEP):
-        inside = [p for f in level if os.access(f, os.R_OK | os.X_OK) for p in sorted(f.iterdir())]
-        inside = [p for p in inside if not p.name.startswith(".") and p.is_dir()]
+        inside = [p for f in level for p in entries_of(f)]
+        inside = [p for p in inside if not p.name.startswith(".") and _can_be_listed(p)]
         inside = inside[: max(0, LOOKED_AT - looked_at)]
         looked_at += len(inside)
         fits = {p: bool(_fitting(p)) for p in inside}

@@ -69,11 +69,11 @@ class Photographs:
         raise InputError(f"{reason}; none of the {len(self._files)} images can be read") from reason
 
 
-class BrokenDepth:
-    """Depth files that cannot be read: their frames have none, and they are counted."""
+class BrokenBeside:
+    """Depth files or maps beside the frames that cannot be read: their frames have none, and they are counted."""
 
-    def __init__(self, notes: Notes) -> None:
-        self._notes, self._first, self._count = notes, "", 0
+    def __init__(self, notes: Notes, what: str) -> None:
+        self._notes, self._what, self._first, self._count = notes, what, "", 0
 
     @contextmanager
     def noted(self, path: Path) -> Iterator[None]:
@@ -82,5 +82,5 @@ class BrokenDepth:
             yield
         except BrokenFile:
             self._first, self._count = self._first or path.name, self._count + 1
-            line = f"depth files that cannot be read are taken as none: {self._count}, the first is {self._first}"
-            self._notes.put("broken depth", line)
+            line = f"{self._what} that cannot be read are taken as none: {self._count}, the first is {self._first}"
+            self._notes.put(f"broken {self._what}", line)

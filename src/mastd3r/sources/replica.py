@@ -8,13 +8,13 @@ file a metre (6553.5). No times: 30 frames a second assumed.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
-from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid_all, without_gaps
+from ..reading.files import short, whole_json
+from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid_all, truth_or_note, without_gaps
 
 KIND = "replica"
 EXPECTED = "Replica (results/frame000000.jpg, results/depth000000.png ..., traj.txt; cam_params.json beside the scene)"
@@ -31,14 +31,13 @@ def looks_like(folder: Path) -> str | None:
 
 def find(folder: Path) -> Sequenced:
     """Frames with depth, poses and lens. Raises InputError."""
-    poses = rigid_all(read_numbers(folder / "traj.txt", 16, "a (4, 4) matrix"), folder / "traj.txt")
     results = folder / "results"
     found = numbered(results, "frame", ".jpg", "images")
-    if len(found) > len(poses):
-        raise InputError(f"{folder / 'traj.txt'}: expected {len(found)} poses, one an image, got {len(poses)}")
-    images = without_gaps(found, len(poses), "images", results)
+    images = without_gaps(found, len(found), "images", results)
     depths = [results / image.name.replace("frame", "depth", 1).replace(".jpg", ".png") for image in images]
-    times = np.arange(len(poses)) / ASSUMED_FPS
+    times = np.arange(len(images)) / ASSUMED_FPS
+    notes = [f"no times: {ASSUMED_FPS:g} frames a second assumed"]
+    true_times, poses = truth_or_note(lambda: _truth(folder / "traj.txt", times), notes)
     file, camera = _camera(folder)
     frames = [
         Listed(float(t), image, depth if depth.is_file() else None)
@@ -49,13 +48,20 @@ def find(folder: Path) -> Sequenced:
         folder.resolve().name,
         frames,
         f"{len(frames)} frames, {sum(f.depth is not None for f in frames)} with depth; lens of {file.name}",
-        times,
+        true_times,
         poses,
         tuple(camera[k] for k in ("fx", "fy", "cx", "cy")),
         (int(camera["w"]), int(camera["h"])),
         units_per_metre=camera["scale"],
-        notes=[f"no times: {ASSUMED_FPS:g} frames a second assumed"],
+        notes=notes,
     )
+
+
+def _truth(file: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    poses = rigid_all(read_numbers(file, 16, "a (4, 4) matrix"), file)
+    if len(poses) != len(times):
+        raise InputError(f"{file}: expected {len(times)} poses, one an image, got {len(poses)}")
+    return times, poses
 
 
 def _camera(folder: Path) -> tuple[Path, dict[str, float]]:
@@ -65,10 +71,10 @@ def _camera(folder: Path) -> tuple[Path, dict[str, float]]:
     if file is None:
         raise InputError(f"{folder}: expected cam_params.json in the folder or beside it, got none")
     try:
-        camera = json.loads(file.read_text(encoding="utf-8"))["camera"]
+        camera = whole_json(file)["camera"]
         numbers = {k: float(camera[k]) for k in KEYS}
-    except (OSError, ValueError, KeyError, TypeError) as e:
+    except (ValueError, LookupError, TypeError, OverflowError) as e:
         raise InputError(f"{file}: expected 'camera' with {', '.join(KEYS)}, got {type(e).__name__} {e}") from e
     if not all(np.isfinite(v) for v in numbers.values()) or min(numbers[k] for k in ("fx", "fy", "scale")) <= 0:
-        raise InputError(f"{file}: expected fx, fy and scale above 0, got {camera}")
+        raise InputError(f"{file}: expected fx, fy and scale above 0, got {short(repr(camera))}")
     return file, numbers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,11 +11,13 @@ import numpy as np
 
 from ..config import Config
 from ..errors import InputError
+from ..reading.files import entries_of
 from ..types import Frame, Source
 from .beside import plain_name, without_word
 from .image_files import MAP_SUFFIXES
 from .notes import Notes
 
+MOST_DIGITS = 18  # of a frame index
 ASSOCIATION_S = 0.02  # two files belong to one moment when their times differ by no more
 
 
@@ -40,10 +43,10 @@ def match_maps(folder: Path, stems: Mapping[int, str], times_s: Mapping[int, flo
     frame index (counted before --start and --stride) or by timestamp in seconds (nearest within 20 ms). ``stems`` may
     be empty (video). Where some are named with such a word, those alone are maps: the folder may be the frames' own.
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError(f"{folder}: expected a folder of probability maps, got no such folder")
     files: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in entries_of(folder):
         if path.suffix.lower() in MAP_SUFFIXES and not path.name.startswith("."):
             if path.stem in files:
                 raise InputError(f"{folder}: expected one map a frame, got {files[path.stem].name} and {path.name}")
@@ -51,7 +54,7 @@ def match_maps(folder: Path, stems: Mapping[int, str], times_s: Mapping[int, flo
     if not files:
         raise InputError(f"{folder}: expected probability maps ({', '.join(MAP_SUFFIXES)}), got none")
     way, found = _by_name(files, stems)
-    if not found and all(s.isdecimal() for s in files):
+    if not found and all(s.isdecimal() and len(s) <= MOST_DIGITS for s in files):
         way, found = _by_index(files, times_s)
     if not found:
         way, found = _by_time(files, times_s)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,17 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import is_file, whole_text
 from ..types import Frame, Truth
 from .checks import check_same_size, window
 from .image_files import read_depth_m, read_probability
 from .notes import Notes
-from .photographs import BrokenDepth, Photographs
+from .photographs import BrokenBeside, Photographs
 from .semantic_maps import match_maps
 
 Array = NDArray[Any]
 ASSUMED_FPS = 30.0  # of datasets whose files carry no times
+MOST_DIGITS = 18  # of a number in a file name
 RIGID_TOLERANCE = 0.02  # how far printed rotations may be from orthonormal: some were accumulated in float32
 
 
@@ -89,11 +91,12 @@ class SequenceSource:
         self.has_semantic = bool(self._semantic)
 
     def frames(self) -> Iterator[Frame]:
-        """Frame after frame; depth and semantic only if wanted. Broken images and depth are left out and noted.
+        """Frame after frame; depth and semantic only if wanted. What is broken is left out and noted.
 
-        Raises InputError at a map that is unreadable, and where the size changes.
+        Raises InputError at a map that is none, and where the size changes.
         """
-        given, broken_depth = 0, BrokenDepth(self._notes)
+        given, broken_depth = 0, BrokenBeside(self._notes, "depth files")
+        broken_maps = BrokenBeside(self._notes, "maps")
         for i, image in self._photographs.images():
             listed = self._found.frames[i]
             depth, semantic = None, None
@@ -102,7 +105,8 @@ class SequenceSource:
                     depth, _ = read_depth_m(listed.depth, self._found.units_per_metre, self._found.no_depth)
                     check_same_size(depth, str(listed.depth), self.size, f"its image {listed.image.name}")
             if self._wants.semantic and i in self._semantic:
-                semantic = read_probability(self._semantic[i])
+                with broken_maps.noted(self._semantic[i]):
+                    semantic = read_probability(self._semantic[i])
             given += 1
             yield Frame(i, listed.timestamp_s, image, depth, semantic)
         self.length = given
@@ -118,6 +122,18 @@ class SequenceSource:
             return None
         focal = self.calibration[0] if self.calibration else None
         return Truth(found.truth_times_s, found.world_from_cam, {}, focal)
+
+
+def truth_or_note(read: Callable[[], tuple[Array, Array]], notes: list[str]) -> tuple[Array, Array]:
+    """Times (n,) and poses (n, 4, 4) as ``read`` gives them; none, and a note, where they cannot be read.
+
+    Truth never stops a run.
+    """
+    try:
+        return read()
+    except InputError as e:
+        notes.append(f"truth is left out: {e}")
+        return np.empty(0), np.empty((0, 4, 4))
 
 
 def calibration_for(
@@ -144,7 +160,7 @@ def numbered(folder: Path, prefix: str, suffix: str, what: str) -> dict[int, Pat
     found: dict[int, Path] = {}
     for path in folder.glob(f"{prefix}*{suffix}"):
         digits = path.name[len(prefix) : len(path.name) - len(suffix)]
-        if digits.isdecimal():
+        if digits.isdecimal() and len(digits) <= MOST_DIGITS:
             found[int(digits)] = path
     if not found:
         raise InputError(f"{folder}: expected {what} {prefix}NNNNNN{suffix}, got none")
@@ -163,12 +179,7 @@ def without_gaps(files: dict[int, Path], count: int, what: str, where: Path) -> 
 
 def read_lines(path: Path) -> list[tuple[int, str]]:
     """Lines that are not empty or comments, each with its number from 1. Raises InputError."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as e:
-        raise InputError(f"{path}: expected a text file, got no such file") from e
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: expected a readable text file, got {e}") from e
+    text = whole_text(path, "a text file")
     lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), 1)]
     return [(n, line) for n, line in lines if line and not line.startswith("#")]
 
@@ -233,5 +244,5 @@ def rigid_all(matrices: Array, where: Path) -> Array:
 
 
 def _check_there(path: Path, what: str) -> None:
-    if not path.is_file():
+    if not is_file(path):
         raise InputError(f"{path}: expected {what}, got no such file")

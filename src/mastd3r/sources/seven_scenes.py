@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid
+from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid, truth_or_note
 
 KIND = "7scenes"
 EXPECTED = "7-Scenes (frame-000000.color.png, .pose.txt, .depth.png ...)"
@@ -40,10 +40,8 @@ def find(folder: Path) -> Sequenced:
     poses = [folder / f"{stem}.pose.txt" for stem in stems.values()]
     depths = [folder / f"{stem}.depth.png" for stem in stems.values()]
     times = np.array(list(images)) / ASSUMED_FPS
-    known = [p.is_file() for p in poses]
-    if any(known) and not all(known):
-        raise InputError(f"{poses[known.index(False)]}: expected a pose as its neighbours have, got no such file")
-    matrices = np.stack([_pose(p) for p in poses]) if all(known) else np.empty((0, 4, 4))
+    notes = [f"no times: {ASSUMED_FPS:g} frames a second assumed", CAVEAT]
+    true_times, matrices = truth_or_note(lambda: _truth(poses, times), notes)
     frames = [
         Listed(float(t), image, depth if depth.is_file() else None)
         for t, image, depth in zip(times, images.values(), depths, strict=True)
@@ -52,13 +50,22 @@ def find(folder: Path) -> Sequenced:
         KIND,
         _name(folder),
         frames,
-        f"{len(frames)} frames, {sum(known)} with a pose, {sum(f.depth is not None for f in frames)} with depth",
-        times if len(matrices) else np.empty(0),
+        f"{len(frames)} frames, {len(matrices)} with a pose, {sum(f.depth is not None for f in frames)} with depth",
+        true_times,
         matrices,
         units_per_metre=1000.0,
         no_depth=NO_DEPTH,
-        notes=[f"no times: {ASSUMED_FPS:g} frames a second assumed", CAVEAT],
+        notes=notes,
     )
+
+
+def _truth(files: list[Path], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    known = [p.is_file() for p in files]
+    if not any(known):
+        return np.empty(0), np.empty((0, 4, 4))
+    if not all(known):
+        raise InputError(f"{files[known.index(False)]}: expected a pose as its neighbours have, got no such file")
+    return times, np.stack([_pose(p) for p in files])
 
 
 def _pose(path: Path) -> np.ndarray:

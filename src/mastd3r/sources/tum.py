@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,11 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import is_file, short, whole_json, whole_text
 from ..types import Frame, Truth
 from .checks import check_same_size, window
 from .image_files import read_depth_m, read_probability
 from .notes import Notes
-from .photographs import BrokenDepth, Photographs
+from .photographs import BrokenBeside, Photographs
 from .semantic_maps import match_maps, nearest_time
 from .sequence import calibration_for
 
@@ -68,21 +69,24 @@ class TumSource:
         if found:
             self._notes.put("found", f"{self.kind}: {found}")
         self._folder = folder
-        self._info = _read_info(folder / "info.json")
+        self._want_depth, self._want_semantic = want_depth, want_semantic
+        self._info = _read_info(folder / "info.json", self._notes, needed=want_depth)
         self._rows = self._present(file_rows(folder / "rgb.txt"), folder / "rgb.txt")
         _check_ascending(self._rows, folder / "rgb.txt")
         self._chosen = window(config, len(self._rows), str(folder / "rgb.txt"))
         self.length: int | None = len(self._chosen)
         self._times = np.array([r.timestamp_s for r in self._rows])
         for i in self._chosen:
-            if not self._image(i).is_file():
+            if not is_file(self._image(i)):
                 row = self._rows[i]
-                raise InputError(f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {row.words[0]}")
+                raise InputError(
+                    f"{folder / 'rgb.txt'} line {row.line}: expected an image file, got no {short(row.words[0])}"
+                )
         self.files = {i: self._image(i) for i in self._chosen}
         self._photographs = Photographs(self.files, self._notes)
         self.size = self._photographs.size
         self.calibration = self._intrinsics() or calibration_for(self.size, lens_size, published, self._notes)
-        self._depth = self._associated("depth.txt")
+        self._depth = self._associated("depth.txt", needed=want_depth)
         self._depth_scale = self._units_per_metre() if self._depth else TUM_DEPTH_SCALE
         if semantic_dir is not None:
             stems = {i: self._image(i).stem for i in self._chosen}
@@ -91,14 +95,15 @@ class TumSource:
         else:
             self._semantic = self._associated("semantic.txt")
         self.has_depth, self.has_semantic = bool(self._depth), bool(self._semantic)
-        self._want_depth, self._want_semantic = want_depth, want_semantic
+        self._true = self._read_truth()  # now: what is wrong with it is told before anything is computed
 
     def frames(self) -> Iterator[Frame]:
-        """Frame after frame; depth and semantic only if wanted. Broken images and depth are left out and noted.
+        """Frame after frame; depth and semantic only if wanted. What is broken is left out and noted.
 
-        Raises InputError at a map that is unreadable, and where the size changes.
+        Raises InputError at a map that is none, and where the size changes.
         """
-        holes, given, broken_depth = 0, 0, BrokenDepth(self._notes)
+        holes, given, broken_depth = 0, 0, BrokenBeside(self._notes, "depth files")
+        broken_maps = BrokenBeside(self._notes, "maps")
         for i, image in self._photographs.images():
             depth, semantic = None, None
             if self._want_depth and i in self._depth:
@@ -109,7 +114,8 @@ class TumSource:
                     if bad:
                         self._notes.put("holes", f"depth: {holes} values that are not finite are taken as none")
             if self._want_semantic and i in self._semantic:
-                semantic = read_probability(self._semantic[i])
+                with broken_maps.noted(self._semantic[i]):
+                    semantic = read_probability(self._semantic[i])
             given += 1
             yield Frame(i, float(self._times[i]), image, depth, semantic)
         self.length = given
@@ -119,11 +125,14 @@ class TumSource:
         return self._photographs.at({i: float(self._times[i]) for i in self._chosen}, timestamp_s)
 
     def truth(self) -> Truth | None:
-        """Poses of groundtruth.txt, masks of mask.txt, focal length of info.json. Raises InputError.
+        """Poses of groundtruth.txt, masks of mask.txt, focal length of info.json.
 
         Masks are keyed by the timestamp of the frame that they belong to. None where the folder has none of
         the three.
         """
+        return self._true
+
+    def _read_truth(self) -> Truth | None:
         times, poses = self._poses()
         moving = {float(self._times[i]): str(p) for i, p in self._associated("mask.txt").items()}
         focal = self._number("fx") or (self.calibration[0] if self.calibration else None)
@@ -141,7 +150,7 @@ class TumSource:
         """The rows whose files are there, where some may be absent. Raises InputError where too many are."""
         if not self.most_absent_ratio:
             return rows
-        there = [row for row in rows if (self._folder / row.words[0]).is_file()]
+        there = [row for row in rows if is_file(self._folder / row.words[0])]
         absent = len(rows) - len(there)
         if absent > self.most_absent_ratio * len(rows):
             raise InputError(f"{path}: expected files beside its {len(rows)} lines, {absent} of them are not there")
@@ -149,12 +158,21 @@ class TumSource:
             self._notes.put(f"absent {path.name}", f"{path.name}: {absent} of {len(rows)} files are absent, left out")
         return there
 
-    def _associated(self, list_name: str) -> dict[int, Path]:
-        """Frame index -> file of a list such as depth.txt, by nearest time within 20 ms."""
+    def _associated(self, list_name: str, needed: bool = False) -> dict[int, Path]:
+        """Frame index -> file of a list such as depth.txt, by nearest time within 20 ms.
+
+        Raises InputError for a list that cannot be read, and is ``needed``; others are left out with a note.
+        """
         path = self._folder / list_name
-        if not path.is_file():
+        if not os.path.lexists(path):
             return {}
-        rows = sorted(self._present(file_rows(path), path), key=lambda r: r.timestamp_s)
+        try:
+            rows = sorted(self._present(file_rows(path), path), key=lambda r: r.timestamp_s)
+        except InputError as e:
+            if needed:
+                raise
+            self._notes.put(list_name, f"{list_name} is left out: {e}")
+            return {}
         at = nearest_time(np.array([r.timestamp_s for r in rows]), self._times[list(self._chosen)])
         found = {i: self._folder / rows[k].words[0] for i, k in zip(self._chosen, at, strict=True) if k >= 0}
         self._notes.put(list_name, f"{list_name}: belongs to {len(found)} of {len(self._chosen)} frames")
@@ -173,29 +191,39 @@ class TumSource:
         if any(v is None for v in four):
             return ()
         distortion = self._info.get("distortion", [])
-        if not isinstance(distortion, list) or not all(isinstance(v, int | float) for v in distortion):
-            raise InputError(f"{self._folder / 'info.json'}: expected distortion as a list, got {distortion!r}")
+        if not isinstance(distortion, list) or not all(_is_number(v) for v in distortion):
+            self._left_out(f"expected distortion as a list of numbers, got {short(repr(distortion))}")
+            return ()
         return (*(v for v in four if v is not None), *(float(v) for v in distortion))
 
     def _number(self, key: str) -> float | None:
         value = self._info.get(key)
         if value is None:
             return None
-        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < np.inf:
-            raise InputError(f"{self._folder / 'info.json'}: expected {key} above 0, got {value!r}")
+        if not _is_number(value) or not value > 0:
+            self._left_out(f"expected {key} above 0, got {short(repr(value))}")
+            return None
         return float(value)
 
+    def _left_out(self, why: str) -> None:
+        if self._want_depth:  # the scale of its depth is in there
+            raise InputError(f"{self._folder / 'info.json'}: {why}")
+        self._notes.put("info", f"info.json is not used as a whole: {why}")
 
-def _read_info(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        return {}
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < FARTHEST
+
+
+def _read_info(path: Path, notes: Notes, needed: bool) -> dict[str, Any]:
+    """info.json; nothing, with a note, where it cannot be read and is not ``needed``."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as e:
-        raise InputError(f"{path}: expected JSON, got {e}") from e
-    if not isinstance(data, dict):
-        raise InputError(f"{path}: expected a JSON object, got {type(data).__name__}")
-    return data
+        return whole_json(path, "JSON") if os.path.lexists(path) else {}
+    except InputError as e:
+        if needed:
+            raise
+        notes.put("info", f"info.json is left out: {e}")
+        return {}
 
 
 def _rows_of(path: Path, words: int, what: str, left_out: list[int] | None = None) -> list[Row]:
@@ -203,10 +231,7 @@ def _rows_of(path: Path, words: int, what: str, left_out: list[int] | None = Non
 
     Raises InputError for a line that is something else; with ``left_out``, its number is put there instead.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as e:
-        raise InputError(f"{path}: expected a readable text file, got {e}") from e
+    text = whole_text(path, "a readable text file")
     rows: list[Row] = []
     for number, line in enumerate(text.splitlines(), 1):
         if not line.strip() or line.lstrip().startswith("#"):
@@ -219,7 +244,7 @@ def _rows_of(path: Path, words: int, what: str, left_out: list[int] | None = Non
         if len(parts) >= words + 1 and np.isfinite(time_s):
             rows.append(Row(number, time_s, tuple(p.strip() for p in parts[1 : words + 1])))
         elif left_out is None:
-            raise InputError(f"{path} line {number}: expected '{what}', got {line.strip()!r}")
+            raise InputError(f"{path} line {number}: expected '{what}', got {short(line.strip())!r}")
         else:
             left_out.append(number)
     if not rows and left_out is None:
@@ -246,7 +271,7 @@ def _read_poses(path: Path, notes: Notes) -> tuple[Array, Array]:
 
     Truth never stops a run: a row that is no pose, or repeats a time, is left out with a note.
     """
-    if not path.is_file():
+    if not os.path.lexists(path):
         return np.empty(0), np.empty((0, 4, 4))
     left_out: list[int] = []
     try:

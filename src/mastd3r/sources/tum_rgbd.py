@@ -22,7 +22,7 @@ CAMERAS: dict[str, tuple[float, ...]] = {
 }
 SIZE = (640, 480)
 RECORDING = re.compile(r"rgbd_dataset_(freiburg[123])_\w+")
-HEAD_LINES = 10
+HEAD_LINES, HEAD_BYTES = 10, 2**14
 
 
 def looks_like(folder: Path) -> str | None:
@@ -32,9 +32,7 @@ def looks_like(folder: Path) -> str | None:
 
 def recording_of(folder: Path) -> tuple[str, str] | None:
     """The recording that rgb.txt names in its head and its camera, None where it names none of the benchmark's."""
-    head: list[str] = []
-    with (folder / "rgb.txt").open(encoding="utf-8-sig", errors="replace") as file:
-        for line, _ in zip(file, range(HEAD_LINES), strict=False):
-            head += [line] if line.startswith("#") else []
-    found = RECORDING.search("".join(head))
+    with (folder / "rgb.txt").open("rb") as file:
+        lines = file.read(HEAD_BYTES).decode("utf-8-sig", "replace").splitlines()[:HEAD_LINES]
+    found = RECORDING.search("\n".join(line for line in lines if line.startswith("#")))
     return (found[0], found[1]) if found else None

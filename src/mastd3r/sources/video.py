@@ -17,12 +17,15 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
+from ..reading.files import resolved
+from ..reading.pictures import check_pixels
 from ..types import Frame, Truth
 from .checks import check_same_size, check_window, window
 from .grey_levels import GreyRange, range_of, spread
 from .image_files import read_probability
 from .interlacing import deinterlaced, interlacing_of
 from .notes import Notes
+from .photographs import BrokenBeside
 from .semantic_maps import match_maps
 
 Array = NDArray[Any]
@@ -30,6 +33,7 @@ Turn = tuple[int, int, int, int]  # row-major 2x2 of 0, 1, -1: (x, y) as stored 
 UPRIGHT: Turn = (1, 0, 0, 1)
 FALLBACK_FPS = Fraction(30)
 GREY = "gray16le"
+LOCAL_ONLY = {"protocol_whitelist": "file"}  # a playlist reads nothing from the net
 ATTACHED_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
@@ -128,7 +132,7 @@ class VideoSource:
 
     def frames(self) -> Iterator[Frame]:
         """Frame after frame. Broken ones are left out and noted. Raises InputError where the size changes."""
-        given = 0
+        given, broken_maps = 0, BrokenBeside(self._notes, "maps")
         decoded: Iterator[_Decoded] = self._decoded(note_end=True)
         if self._interlacing is not None:
             decoded = deinterlaced(decoded, self._interlacing)
@@ -140,7 +144,8 @@ class VideoSource:
             check_same_size(image, where, self.size, "the first frame")
             semantic = None
             if self._want_semantic and d.index in self._semantic:
-                semantic = read_probability(self._semantic[d.index])
+                with broken_maps.noted(self._semantic[d.index]):
+                    semantic = read_probability(self._semantic[d.index])
             given += 1
             yield Frame(d.index, d.timestamp_s, image, semantic=semantic)
         self.length = given
@@ -254,7 +259,7 @@ class VideoSource:
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first real video stream. Raises InputError."""
     try:
-        container = av.open(str(path.resolve()))
+        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, metadata_errors="replace")
     except av.FFmpegError as e:
         raise InputError(f"{path}: {_why_not(path)}") from e
     with container:
@@ -265,6 +270,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             raise InputError(
                 f"{path}: expected a video, got a {container.format.name} file without moving pictures that can be read"
             )
+        check_pixels((stream.codec_context.width, stream.codec_context.height), str(path))
         yield container, stream
 
 
