@@ -22,6 +22,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from mastd3r.config import SourceConfig
 from mastd3r.export.machine import machine_info
 from mastd3r.sources import open_source
 
@@ -77,7 +78,7 @@ def _ours(sequence: Path, out: Path) -> dict[str, Any]:
 
 def _anchor(python: str, sequence: Path, work: Path, frames: int) -> dict[str, Any]:
     """pycolmap on the frames that ours read, in images of their own name; {"missing": why} without it."""
-    source = open_source(sequence)
+    source = open_source(sequence, SourceConfig())
     images = work / "images"
     images.mkdir()
     for file in (source.files or {}).values():  # type: ignore[attr-defined]

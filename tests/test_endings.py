@@ -205,7 +205,7 @@ def test_a_fault_outside_a_run_names_a_file_with_its_traceback(
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     monkeypatch.setattr(pipeline, "load", broken)
-    assert main(["view", str(tmp_path)]) == 1
+    assert main(["eval", str(tmp_path), str(tmp_path)]) == 1
     said = capfd.readouterr().err
     kept = next(tmp_path.glob("mastd3r-*.log"))
     assert said.count("\n") == 1 and str(kept) in said and "ZeroDivisionError" in kept.read_text()

@@ -157,9 +157,9 @@ def test_files_that_are_no_weights_are_refused(tmp_path: Path, content: bytes, w
 
 
 def test_files_that_cannot_be_read_are_refused(tmp_path: Path) -> None:
-    refused(tmp_path / "absent.pth", "expected a readable file, got No such file")
+    refused(tmp_path / "absent.pth", "expected weights, got no such file")
     (tmp_path / "folder.pth").mkdir()
-    refused(tmp_path / "folder.pth", "expected a readable file")
+    refused(tmp_path / "folder.pth", "expected weights, got a folder")
 
 
 def test_safetensors_without_its_package_says_what_to_install(

@@ -299,7 +299,7 @@ def weights(server: FileServer, capsys: pytest.CaptureFixture[str], monkeypatch:
         parser = argparse.ArgumentParser()
         cli_weights.weights_parser(parser)
         args = parser.parse_args(words)
-        code = args.act(args, Console(stderr=True))
+        code = args.act(args, Console(stderr=True, force_terminal=True))
         said = capsys.readouterr()
         return code, said.out, said.err
 

@@ -214,7 +214,7 @@ def test_pictures_come_from_the_photographs_while_they_are_there(run: Path) -> N
     (run / "masks.mp4").write_bytes(b"no video")
     assert "no such path" in Pictures(read_run(run)).at(times[3]).said
     (run / "masks.mp4").unlink()
-    edited_record(run, source=5)
+    edited_record(run, source=None)
     assert Pictures(read_run(run)).at(0.123).said
 
 
@@ -320,8 +320,9 @@ def test_a_browser_for_terminals_is_none(monkeypatch: pytest.MonkeyPatch) -> Non
     [
         ("run.json", b"{", "expected readable JSON"),
         ("run.json", None, "expected a run folder"),
-        ("run.json", b'{"states": 7}', "expected states"),
-        ("gaussians.ply", PLY + b"element vertex x\nend_header\n", "3-D Gaussian .ply"),
+        ("run.json", b'{"states": 7}', "states: expected pairs"),
+        ("gaussians.ply", PLY + b"element vertex x\nend_header\n", "elements and properties"),
+        ("gaussians.ply", PLY + b"element vertex 0\nproperty float x\nend_header\n", "3-D Gaussian .ply"),
         ("cloud.ply", PLY + b"element vertex 5\nproperty float x\nend_header\n", "bytes"),
         ("cloud.ply", PLY + b"element\nend_header\n", "elements and properties"),
         ("mesh.glb", b"glTF\2\0\0\0\xff\0\0\0", "whole .glb"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..geometry.se3 import se3_exp
 from ..types import USABLE_WEIGHT
 
 Array = NDArray[Any]
+EXACT = 1e12  # information of an inverse depth that is not in doubt
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,16 @@ class StaticMatches:
             values[some] for values in (self.px, self.inv_depth, self.depth_info, self.target, self.weight)
         )
         return StaticMatches(px, inv_depth, info, target, weight, self.intrinsics)
+
+    def as_known(self) -> StaticMatches:
+        """The same, every depth taken as exact."""
+        return replace(self, depth_info=np.full(len(self.px), EXACT))
+
+    def cost(self, new_from_ref: Array, kernel_px: float) -> float:
+        """The robust cost of a pose, each depth marginalised."""
+        args = (self.px, self.inv_depth, self.depth_info, self.target, self.weight)
+        found: float = pose_system(*args, new_from_ref, self.intrinsics, kernel_px)[2]
+        return found
 
     def residual_px(self, new_from_ref: Array) -> Array:
         """(p,) norm of the re-mapping residual; 1e3 behind the camera."""

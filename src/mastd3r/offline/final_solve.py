@@ -22,6 +22,7 @@ from ..graph.turning import observed, put_at_infinity
 from ..types import State, Trajectory
 
 Array = NDArray[Any]
+MOST_FIT_PX, CLEARLY = 0.3, 0.8  # kernel by which two minima are told apart, and the share of the cost that is less
 log = logging.getLogger(__name__)
 
 
@@ -91,11 +92,22 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
 
 
 def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
+    """The pose (4, 4) from the keyframe that the kept matches say.
+
+    Where depths are in doubt there may be two minima: one that fits most matches well, and one that fits a few more of
+    them badly, such as those on something that moves. The other is looked for as if depths were known.
+    """
     if len(record.points) < 20:
         return guess
     matches = kept_matches(graph, record)
     near = solve_pose(matches, guess, kernel_px=3.0).new_from_ref
-    return solve_pose(matches, near, kernel_px=1.0).new_from_ref
+    pose = solve_pose(matches, near, kernel_px=1.0).new_from_ref
+    known = matches.as_known()
+    near = solve_pose(known, guess, kernel_px=3.0).new_from_ref
+    near = solve_pose(known, near, kernel_px=1.0).new_from_ref
+    other = solve_pose(matches, near, kernel_px=1.0).new_from_ref
+    better = matches.cost(other, MOST_FIT_PX) < CLEARLY * matches.cost(pose, MOST_FIT_PX)
+    return other if better else pose
 
 
 def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:

@@ -20,6 +20,7 @@ Array = NDArray[Any]
 
 LEAST_ALIKE = 0.7  # correlation of two patches, below which they show different things
 SMOOTH_PX = 5.0  # blur of the dense flow before its slope is taken as the local warp
+LARGE_PX = 100_000  # pixels of an image from which on half its size is enough for near flow
 SMOOTH_AT = 4  # which is done on a picture so many times smaller
 STEP_PX = 3.0  # of those differences
 MOST_BENT = 0.45  # largest entry of the local warp's difference from the identity; keeps it invertible
@@ -62,11 +63,13 @@ class FlowMatcher:
     def dense(self, ref: Array, new: Array, start: Array | None = None, *, near: bool = False) -> Array:
         """(h, w, 2) flow ref -> new. With a start, ``new`` is first warped by it and only the rest is searched.
 
-        ``near``: that is a few pixels, and half the size will do; that of the flow is half then, too.
+        ``near``: that is a few pixels, and half the size will do where the image is large; that of the flow is half
+        then, too.
         """
         if start is None:
             flow: Array = self._engine("whole").calc(ref, new, None)
             return flow
+        near = near and self.width * self.height >= LARGE_PX
         if near:
             ref, new = (cv2.resize(image, self._half_size, interpolation=cv2.INTER_AREA) for image in (ref, new))
         start = resized_flow(start, ref.shape[1], ref.shape[0])

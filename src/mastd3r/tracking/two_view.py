@@ -51,7 +51,8 @@ class TwoViewEstimator:
         """The frame against the keyframe that is followed, eq. (5)-(7), from where the last frame was."""
         if state.anchor is None or seen.blank:
             return AlignmentProblem.nothing(state.cam_from_anchor)
-        return self.problem(state.anchor, seen.work, prior, state.flow, state.cam_from_anchor, near=True)
+        ref = state.anchor
+        return self.problem(ref, seen.work, prior, state.flow, state.cam_from_anchor, near=self._started(ref))
 
     def problem(
         self,
