@@ -13,6 +13,7 @@ import pytest
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
+@pytest.mark.slow
 def test_every_part_that_a_cpu_can_do(room_clip: Path, tmp_path: Path) -> None:
     pytest.importorskip("transformers", reason="DINOv2 needs pip install 'mastd3r-slam[networks]'")
     out = tmp_path / "networks.json"

@@ -72,6 +72,7 @@ def test_people_are_found_without_any_semantics() -> None:
     assert play(DynamicsConfig(), walk=True, maps=False, start=40, count=50)[0] > 0.6
 
 
+@pytest.mark.slow
 def test_with_maps_better_than_the_maps_alone() -> None:
     ours, alone, _ = play(DynamicsConfig(), walk=True, maps=True, start=0, count=200)
     assert ours > alone + 0.01

@@ -55,6 +55,7 @@ def independent_look(run: Path, clip: Path, width: int) -> dict[str, Any]:
     return data
 
 
+@pytest.mark.slow
 def test_the_room_at_its_usual_size(tmp_path: Path) -> None:
     """48 frames at 320x240 with a moving ball, nothing given: every frame posed, ATE within 1.5 % of the path."""
     clip = make_room_clip(tmp_path / "room", frames=48)
@@ -165,6 +166,7 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     assert file_alone["opaque"] == pytest.approx(metrics["opaque_holdout"], abs=0.03) and file_alone["near"] < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short_flight")
 def test_refined_poses_are_those_of_the_trajectory(room_clip: Path, tmp_path: Path) -> None:
     """Where training moves the cameras, every frame is placed in the map, and the file is judged from there."""

@@ -116,6 +116,7 @@ def test_a_finished_run_gives_cloud_and_mesh(run: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["m.glb", "sub"]
 
 
+@pytest.mark.slow
 def test_eval_scores_the_cloud_by_the_depth_of_the_sequence(run: Path, tmp_path: Path) -> None:
     scored = tmp_path / "run"
     shutil.copytree(run, scored)

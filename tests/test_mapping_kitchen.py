@@ -61,6 +61,7 @@ def seeds(frames: list[int], world_from_cam: np.ndarray, colors: dict[int, np.nd
     return StaticCloud(xyz, color, np.ones(len(xyz), np.float32), spread, np.concatenate(ids).astype(np.int32))
 
 
+@pytest.mark.slow
 def test_unseen_frames_of_a_real_room_are_drawn_well() -> None:
     if not (DATA / "rgb.txt").exists():
         pytest.skip(f"no data at {DATA}; set MASTD3R_DATA")

@@ -46,6 +46,7 @@ def cloud(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
     return fused(views, maps)
 
 
+@pytest.mark.slow
 def test_trusted_depth_is_right_and_on_most_of_the_picture(truth: list[SyntheticView], maps: DepthMaps) -> None:
     depth, static = np.stack([v.depth_m for v in truth]), ~np.stack([v.moving for v in truth])
     trusted = maps.trusted
@@ -55,12 +56,14 @@ def test_trusted_depth_is_right_and_on_most_of_the_picture(truth: list[Synthetic
     assert trusted.sum() / static.sum() > 0.6
 
 
+@pytest.mark.slow
 def test_what_moves_has_no_depth(truth: list[SyntheticView], maps: DepthMaps) -> None:
     moving = np.stack([v.moving for v in truth])
     assert moving.sum() > 1000
     assert not maps.trusted[moving].any()
 
 
+@pytest.mark.slow
 def test_the_cloud_lies_on_the_room_with_its_normals(truth: list[SyntheticView], cloud: DenseCloud) -> None:
     room = np.concatenate([points_of(v, 1) for v in truth])
     away, _ = cKDTree(room).query(cloud.points_world[::7])
@@ -72,10 +75,12 @@ def test_the_cloud_lies_on_the_room_with_its_normals(truth: list[SyntheticView],
     assert cloud.confidence.min() > 0 and cloud.confidence.max() <= 1
 
 
+@pytest.mark.slow
 def test_a_surface_is_given_once(maps: DepthMaps, cloud: DenseCloud) -> None:
     assert len(cloud.points_world) < 0.6 * maps.trusted.sum()
 
 
+@pytest.mark.slow
 def test_the_mesh_lies_on_the_room(truth: list[SyntheticView], views: list[StereoView], maps: DepthMaps) -> None:
     mesh = meshed(views, maps)
     room = cKDTree(np.concatenate([points_of(v, 1) for v in truth]))
@@ -90,6 +95,7 @@ def test_the_mesh_lies_on_the_room(truth: list[SyntheticView], views: list[Stere
     assert mesh.colors.std() > 10
 
 
+@pytest.mark.slow
 def test_the_same_again(views: list[StereoView], truth: list[SyntheticView]) -> None:
     some, points = views[:3], np.concatenate([points_of(v, 10) for v in truth[:3]])
     first, second = (dense_depth(some, points, lambda: None) for _ in range(2))
