@@ -56,6 +56,7 @@ def main() -> int:
     for name in args.only:
         with tempfile.TemporaryDirectory() as work:
             entry: dict[str, Any] = {"ours": _ours(args.data / name, Path(work) / "run")}
+        print(name, json.dumps(entry), flush=True)
         with tempfile.TemporaryDirectory() as work:
             entry["anchor"] = _anchor(args.anchor_python, args.data / name, Path(work), entry["ours"]["frames"])
         anchor_s = entry["anchor"].get("s_per_frame")
@@ -83,7 +84,10 @@ def _anchor(python: str, sequence: Path, work: Path, frames: int) -> dict[str, A
     images.mkdir()
     for file in (source.files or {}).values():  # type: ignore[attr-defined]
         (images / file.name).symlink_to(file.resolve())
-    told, costs = _measured([python, "-c", ANCHOR, str(images), str(work)], check=False)
+    try:
+        told, costs = _measured([python, "-c", ANCHOR, str(images), str(work)], check=False)
+    except OSError as e:
+        return {"missing": f"{python}: {e.strerror}"}
     if costs["exit"] != 0:
         return {"missing": (told.strip().splitlines() or ["it ended without a word"])[-1]}
     return {**json.loads(told.strip().splitlines()[-1]), **_a_frame(costs, frames)}
