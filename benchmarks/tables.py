@@ -3,8 +3,8 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a folder
-plots beside the page, the curve of the stress suite beside it.
+live.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a
+folder plots beside the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from live_table import live
 from map_tables import map_sections
 from masks_tables import masks
 from networks_table import networks
+from speed_table import speed
 from splats_table import splats
 from stress_table import PICTURE, stress
 
@@ -87,6 +88,7 @@ def main() -> int:
     lines += dense(source.parent / "dense.json")
     lines += experiments(source.parent / "bench", target.parent / "plots")
     lines += map_sections(source.parent)
+    lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")
