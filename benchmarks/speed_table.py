@@ -14,14 +14,13 @@ def speed(path: Path) -> list[str]:
     entries: dict[str, dict[str, Any]] = json.loads(path.read_text())
     out = ["", "## Speed", ""]
     out.append(
-        f"By `python benchmarks/speed.py --data DATA --out {path.as_posix()}`: `mastd3r run SEQUENCE --no-map` from the "
-        "start of its process to the end, reading, masks, cloud and report included; core s: processor time of all "
-        "threads. The anchor is pycolmap on the same images, right after it on the same machine."
+        f"By `python benchmarks/speed.py --data DATA --out {path.as_posix()}`: `mastd3r run SEQUENCE --no-map` from "
+        "the start of its process to the end, reading, masks, cloud and report included; core s: processor time of "
+        "all threads. The anchor is pycolmap on the same images, right after it on the same machine."
     )
     out += ["", "| sequence | frames | s a frame | core s a frame | tracking [frames/s] | tracking, core s a frame |"]
-    out[-1] += (
-        " peak memory [MiB] | ATE all | keyframes | anchor, s a frame | times faster | date | commit | processor |"
-    )
+    out[-1] += " peak memory [MiB] | ATE all | keyframes | anchor, s a frame | times faster | date | commit |"
+    out[-1] += " processor |"
     out.append("|---" * 14 + "|")
     for name, e in entries.items():
         ours, anchor, machine = e["ours"], e["anchor"], e["machine"]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .motion import _JIT, _bounded, _odds, _widened
+from .pixels import between_pixels
 
 Array = NDArray[Any]
 _F = np.float32
@@ -26,16 +27,8 @@ def _round_trip(forward: Array, backward: Array, inside: Array, sigma_px: float,
             if not (inside[j, i] > 0 and 0 <= u <= w - 1 and 0 <= v <= h - 1):
                 out[j, i] = -np.inf
                 continue
-            a, b = min(int(u), w - 2), min(int(v), h - 2)
-            p, q = u - _F(a), v - _F(b)
-            top = (_F(1) - p) * (_F(1) - q)
-            for k in range(2):
-                back = top * backward[b, a, k] + p * (_F(1) - q) * backward[b, a + 1, k]
-                back += (_F(1) - p) * q * backward[b + 1, a, k] + p * q * backward[b + 1, a + 1, k]
-                if k == 0:
-                    fx += back
-                else:
-                    fy += back
+            fx += between_pixels(backward[..., 0], u, v)
+            fy += between_pixels(backward[..., 1], u, v)
             out[j, i] = per * (fx * fx + fy * fy)
 
 
@@ -92,11 +85,7 @@ def grey_differences(gray: Array, stable: Array, gain: float, left: Array, as_st
             as_static[j, i] = still * still
             u = min(max(_F(i) + left[j, i, 0], _F(0)), _F(w - 1))
             v = min(max(_F(j) + left[j, i, 1], _F(0)), _F(h - 1))
-            a, b = min(int(u), w - 2), min(int(v), h - 2)
-            p, q = u - _F(a), v - _F(b)
-            top = _F(stable[b, a]) * (_F(1) - p) + _F(stable[b, a + 1]) * p
-            low = _F(stable[b + 1, a]) * (_F(1) - p) + _F(stable[b + 1, a + 1]) * p
-            moved = here - gain * (top * (_F(1) - q) + low * q)
+            moved = here - gain * between_pixels(stable, u, v)
             as_flow[j, i] = moved * moved
 
 

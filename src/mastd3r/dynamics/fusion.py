@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
 from .motion import _JIT
+from .pixels import between_pixels
 from .refinement import EdgeRefinement
 
 Array = NDArray[Any]
@@ -43,11 +44,7 @@ def _squared_difference(small: Array, other: Array, flow: Array, out: Array) -> 
             u, v = _F(i) + flow[j, i, 0], _F(j) + flow[j, i, 1]
             there = _F(OUTSIDE_GREY)
             if 0 <= u <= w - 1 and 0 <= v <= h - 1:
-                a, b = min(int(u), w - 2), min(int(v), h - 2)
-                p, q = u - _F(a), v - _F(b)
-                top = _F(other[b, a]) * (_F(1) - p) + _F(other[b, a + 1]) * p
-                low = _F(other[b + 1, a]) * (_F(1) - p) + _F(other[b + 1, a + 1]) * p
-                there = top * (_F(1) - q) + low * q
+                there = between_pixels(other, u, v)
             there -= _F(small[j, i])
             out[j, i] = there * there
 
@@ -70,11 +67,7 @@ def _carried_along(log_odds: Array, flow: Array, memory: float, out: Array) -> N
             u, v = _F(i) + flow[j, i, 0], _F(j) + flow[j, i, 1]
             out[j, i] = 0
             if 0 <= u <= w - 1 and 0 <= v <= h - 1:
-                a, b = min(int(u), w - 2), min(int(v), h - 2)
-                p, q = u - _F(a), v - _F(b)
-                top = log_odds[b, a] * (_F(1) - p) + log_odds[b, a + 1] * p
-                low = log_odds[b + 1, a] * (_F(1) - p) + log_odds[b + 1, a + 1] * p
-                out[j, i] = memory * (top * (_F(1) - q) + low * q)
+                out[j, i] = memory * between_pixels(log_odds, u, v)
 
 
 def with_depth(fresh: Array, depth: Array) -> Array:
