@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from mastd3r.camera.pinhole import Camera
+from mastd3r.dynamics.comparison_kernels import flow_log_ratio, grey_differences
 from mastd3r.dynamics.config import DynamicsConfig
 from mastd3r.dynamics.data import DynamicsInput
 from mastd3r.dynamics.depth import depth_log_ratio
 from mastd3r.dynamics.motion import (
     flow_covariance,
-    motion_log_ratio,
     noise_inflation,
     pose_jacobian,
     residual_twist,
@@ -34,6 +34,18 @@ def rays_of(camera: Camera) -> np.ndarray:
 
 def cov_of(xx: float, xy: float, yy: float) -> np.ndarray:
     return np.array([[[xx, xy, yy]]], np.float32)
+
+
+def motion_log_ratio(
+    residual: np.ndarray, cov: np.ndarray, slope: tuple[float, float] = (0.0, 0.0), inv_depth_sigma: float = 0.0
+) -> np.ndarray:
+    """log p(residual | moving) - log p(residual | static), where pose and twist explain nothing of it."""
+    shape = residual.shape[:2]
+    slopes = np.broadcast_to(np.array(slope, np.float32), (*shape, 2)).copy()
+    geometry = residual, np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32), slopes
+    noise = np.full(shape, inv_depth_sigma, np.float32), cov, 1.0
+    shares = CONFIG.motion.spread_px**2, CONFIG.still_share, CONFIG.outlier_share
+    return flow_log_ratio(geometry, np.zeros(6, np.float32), noise, shares)
 
 
 def test_rigid_flow_is_projection_of_the_moved_points() -> None:
@@ -63,17 +75,17 @@ def test_points_at_infinity_only_feel_the_rotation() -> None:
 
 def test_what_a_depth_can_explain_does_not_count_as_motion() -> None:
     """The same 4 px: along the epipolar line with unknown depth nothing, across it moving."""
-    cov = cov_of(0.1 + 10.0**2, 0, 0.1)
-    along = motion_log_ratio(np.array([[[4.0, 0.0]]], np.float32), cov, CONFIG)[0, 0]
-    across = motion_log_ratio(np.array([[[0.0, 4.0]]], np.float32), cov, CONFIG)[0, 0]
+    cov, unknown = cov_of(0.1, 0, 0.1), {"slope": (10.0, 0.0), "inv_depth_sigma": 1.0}
+    along = motion_log_ratio(np.array([[[4.0, 0.0]]], np.float32), cov, **unknown)[0, 0]
+    across = motion_log_ratio(np.array([[[0.0, 4.0]]], np.float32), cov, **unknown)[0, 0]
     assert along < 0.3
     assert across > 2.0
 
 
 def test_motion_ratio_is_bounded_by_the_shares_and_silent_without_texture() -> None:
-    far = motion_log_ratio(np.array([[[300.0, 0.0]]], np.float32), cov_of(0.1, 0, 0.1), CONFIG)[0, 0]
-    near = motion_log_ratio(np.zeros((1, 1, 2), np.float32), cov_of(1e-4, 0, 1e-4), CONFIG)[0, 0]
-    blank = motion_log_ratio(np.zeros((1, 1, 2), np.float32), cov_of(400.0, 0, 400.0), CONFIG)[0, 0]
+    far = motion_log_ratio(np.array([[[300.0, 0.0]]], np.float32), cov_of(0.1, 0, 0.1))[0, 0]
+    near = motion_log_ratio(np.zeros((1, 1, 2), np.float32), cov_of(1e-4, 0, 1e-4))[0, 0]
+    blank = motion_log_ratio(np.zeros((1, 1, 2), np.float32), cov_of(400.0, 0, 400.0))[0, 0]
     assert far == pytest.approx(-np.log(CONFIG.outlier_share) + np.log(1 - CONFIG.still_share), abs=0.05)
     assert near == pytest.approx(np.log(CONFIG.still_share) - np.log(1 - CONFIG.outlier_share), abs=0.05)
     assert abs(blank) < 0.1
@@ -131,9 +143,16 @@ def test_grey_differences_are_as_wide_as_their_variance_says_for_noise_and_wider
     rng = np.random.default_rng(2)
     image = cv2.GaussianBlur(rng.uniform(0, 255, (60, 80)).astype(np.float32), (0, 0), 2)
     variance = photo_variance(texture_information(image.astype(np.uint8), 7, CONFIG.motion.texture_noise), CONFIG)
-    noise = CONFIG.photometric.noise * rng.standard_normal(image.shape).astype(np.float32)
-    assert np.median(cv2.blur(noise**2, (3, 3)) / variance) < 1.3
-    assert np.median(40.0**2 / variance) > 8
+    noisy = image + CONFIG.photometric.noise * rng.standard_normal(image.shape).astype(np.float32)
+
+    def mismatch(other: np.ndarray) -> float:
+        square, still = np.empty(image.shape, np.float32), np.zeros((*image.shape, 2), np.float32)
+        pair = (np.rint(i).clip(0, 255).astype(np.uint8) for i in (image, other))
+        grey_differences(*pair, np.float32(1), still, square, np.empty_like(square))
+        return float(np.median(cv2.blur(square, (3, 3)) / variance))
+
+    assert mismatch(noisy) < 1.3
+    assert mismatch(image + 40) > 8
 
 
 def test_pooling_fills_a_region_and_stops_at_its_edge() -> None:
@@ -178,7 +197,7 @@ def test_evidence_of_a_wrong_pose_is_weak() -> None:
     rng = np.random.default_rng(1)
     cov = np.full((96, 128, 3), 0.0, np.float32) + np.array([0.1, 0.0, 0.1], np.float32)
     residual = (rng.normal(size=(96, 128, 2)) * 3).astype(np.float32)
-    plain = motion_log_ratio(residual, cov, CONFIG)
+    plain = motion_log_ratio(residual, cov)
     factor = noise_inflation(residual.reshape(-1, 2), cov.reshape(-1, 3), np.ones(96 * 128, np.float32))
-    inflated = motion_log_ratio(residual, cov * np.float32(factor), CONFIG)
+    inflated = motion_log_ratio(residual, cov * np.float32(factor))
     assert (plain > 1).mean() > 0.8 and (inflated > 1).mean() < 0.2

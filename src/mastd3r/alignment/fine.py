@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.point_kernels import point_system
-from ..geometry.reprojection_kernels import pose_system
 from ..geometry.se3 import se3_exp, transform
 from ..types import USABLE_WEIGHT
 from .reproject import PoseReport, StaticMatches
@@ -83,9 +82,7 @@ class _Terms:
         """Normal equations (7, 7), (7,) and cost."""
         hess, rhs, cost = np.zeros((7, 7)), np.zeros(7), 0.0
         if self.own is None or not self.as_printed:
-            m = self.matches
-            args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
-            hess[:6, :6], rhs[:6], cost = pose_system(*args, pose, m.intrinsics, self.kernel_px)
+            hess[:6, :6], rhs[:6], cost = self.matches.system(pose, self.kernel_px)
         if self.own is None:
             return hess, rhs, cost
         for h, b, c in self._points(self.own, pose, log_scale):

@@ -40,19 +40,23 @@ class StaticMatches:
         if len(used) <= most:
             return self
         some = used[np.linspace(0, len(used) - 1, most).astype(int)]
-        px, inv_depth, info, target, weight = (
-            values[some] for values in (self.px, self.inv_depth, self.depth_info, self.target, self.weight)
+        return replace(
+            self,
+            px=self.px[some],
+            inv_depth=self.inv_depth[some],
+            depth_info=self.depth_info[some],
+            target=self.target[some],
+            weight=self.weight[some],
         )
-        return StaticMatches(px, inv_depth, info, target, weight, self.intrinsics)
 
     def as_known(self) -> StaticMatches:
         """The same, every depth taken as exact."""
         return replace(self, depth_info=np.full(len(self.px), EXACT))
 
-    def cost(self, new_from_ref: Array, kernel_px: float) -> float:
-        """The robust cost of a pose, each depth marginalised."""
+    def system(self, new_from_ref: Array, kernel_px: float) -> tuple[Array, Array, float]:
+        """Normal equations (6, 6), (6,) of a pose, and its robust cost, each depth marginalised."""
         args = (self.px, self.inv_depth, self.depth_info, self.target, self.weight)
-        found: float = pose_system(*args, new_from_ref, self.intrinsics, kernel_px)[2]
+        found: tuple[Array, Array, float] = pose_system(*args, new_from_ref, self.intrinsics, kernel_px)
         return found
 
     def residual_px(self, new_from_ref: Array) -> Array:
@@ -95,10 +99,7 @@ class _Pose:
 
     @cached_property
     def _system(self) -> tuple[Array, Array, float]:
-        m = self.matches
-        args = (m.px, m.inv_depth, m.depth_info, m.target, m.weight)
-        found: tuple[Array, Array, float] = pose_system(*args, self.new_from_ref, m.intrinsics, self.kernel_px)
-        return found
+        return self.matches.system(self.new_from_ref, self.kernel_px)
 
     def linearised(self) -> tuple[Array, Array, float]:
         return self._system

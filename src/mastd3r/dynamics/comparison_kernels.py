@@ -8,14 +8,14 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .motion import _JIT, _bounded, _odds, _widened
-from .pixels import between_pixels
+from .motion import bounded, odds, widened
+from .pixels import JIT, between_pixels
 
 Array = NDArray[Any]
 _F = np.float32
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _round_trip(forward: Array, backward: Array, inside: Array, sigma_px: float, out: Array) -> None:
     """``out`` (h, w): -(|forward + backward there| / sigma)² / 2; minus infinity where it leaves the image."""
     h, w = out.shape
@@ -42,7 +42,7 @@ def round_trip_confidence(forward: Array, backward: Array, inside: Array, sigma_
     return np.exp(out, out=out)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _unexplained(
     left: Array, xy: Array, near: Any, twist: Array, slope: Array, sigma: Any, cov: Array
 ) -> tuple[Any, Any, Any, Any, Any]:
@@ -51,12 +51,12 @@ def _unexplained(
     x, y = xy[0], xy[1]
     rx = left[0] - (near * (twist[0] - x * twist[2]) - x * y * twist[3] + (_F(1) + x * x) * twist[4] - y * twist[5])
     ry = left[1] - (near * (twist[1] - y * twist[2]) - (_F(1) + y * y) * twist[3] + x * y * twist[4] + x * twist[5])
-    dx, dy = _bounded(slope[0] * sigma), _bounded(slope[1] * sigma)
+    dx, dy = bounded(slope[0] * sigma), bounded(slope[1] * sigma)
     dx, dy = float(dx), float(dy)  # squares of a lost pixel's leave float32
     return rx, ry, cov[0] + dx * dx, cov[1] + dx * dy, cov[2] + dy * dy
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def unexplained_every(
     left: Array, xy: Array, near: Array, twist: Array, slope: Array, sigma: Array, cov: Array, step: int
 ) -> tuple[Array, Array]:
@@ -74,7 +74,7 @@ def unexplained_every(
     return residual, wide
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def grey_differences(gray: Array, stable: Array, gain: float, left: Array, as_static: Array, as_flow: Array) -> None:
     """Squared differences of ``gray`` (h, w) uint8 and ``stable`` times ``gain``: in place, and along ``left``."""
     h, w = gray.shape
@@ -89,7 +89,7 @@ def grey_differences(gray: Array, stable: Array, gain: float, left: Array, as_st
             as_flow[j, i] = moved * moved
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def mean_ratio(a: Array, b: Array, inside: Array) -> Any:
     """Mean of ``a`` over that of ``b`` where ``inside`` (h, w) is 1; both are uint8."""
     over, under, count = _F(0), _F(0), inside.size
@@ -100,8 +100,8 @@ def mean_ratio(a: Array, b: Array, inside: Array) -> Any:
     return over / max(under, _F(1e-3) * _F(count))
 
 
-@nb.njit(**_JIT)
-def matched_share(confidence: Array, inside: Array, static: Array, covered: Array) -> float:
+@nb.njit(**JIT)
+def confident_share(confidence: Array, inside: Array, static: Array, covered: Array) -> float:
     """Mean ``confidence`` of the static scene that nothing covers."""
     found, scene = 0.0, 0.0
     for j in range(inside.shape[0]):
@@ -115,7 +115,7 @@ def matched_share(confidence: Array, inside: Array, static: Array, covered: Arra
 Geometry = tuple[Array, Array, Array, Array]  # the flow left over; xy, inv_depth and slope of the rigid flow
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _motion_terms(
     geometry: Geometry, twist: Array, noise: tuple[Array, Array, float], spread: float, log_part: Array, factor: Array
 ) -> None:
@@ -125,41 +125,45 @@ def _motion_terms(
         for i in range(factor.shape[1]):
             found = _unexplained(left[j, i], xy[j, i], near[j, i], twist, slope[j, i], sigma[j, i], cov[j, i])
             rx, ry, xx, xxy, yy = found
-            log_part[j, i], factor[j, i] = _widened(rx, ry, inflation * xx, inflation * xxy, inflation * yy, spread)
+            log_part[j, i], factor[j, i] = widened(rx, ry, inflation * xx, inflation * xxy, inflation * yy, spread)
 
 
-@nb.njit(**_JIT)
-def _odds_of(widened: Array, factor: Array, still_share: float, outlier_share: float) -> None:
-    """In place: ``widened`` becomes the odds."""
-    for j in range(widened.shape[0]):
-        for i in range(widened.shape[1]):
-            widened[j, i] = _odds(widened[j, i] * factor[j, i], still_share, outlier_share)
+@nb.njit(**JIT)
+def _odds_of(ratio: Array, factor: Array, still_share: float, outlier_share: float) -> None:
+    """In place: the exponential of ``widened`` becomes the odds."""
+    for j in range(ratio.shape[0]):
+        for i in range(ratio.shape[1]):
+            ratio[j, i] = odds(ratio[j, i] * factor[j, i], still_share, outlier_share)
 
 
 def flow_log_ratio(
     geometry: Geometry, twist: Array, noise: tuple[Array, Array, float], shares: tuple[float, float, float]
 ) -> Array:
-    """(h, w) float32 ``motion_log_ratio`` of the flow that ``twist`` (6,), times the focal length, does not explain.
+    """log p(r | moving) - log p(r | static), (h, w) float32, of the flow r that ``twist`` (6,) does not explain.
 
+    Static: Normal(0, cov), wider by what the depth's 1 sigma may do along the epipolar line, with a share of wrong
+    flow. Moving: the same widened by the spread, and a share that shows no motion against the background. Bounded on
+    both sides by the shares, near 0 where cov is wide, and 0 where a number is not finite. ``twist`` is given times the
+    focal length.
     ``noise``: 1 sigma of inverse depth (h, w), covariance of the flow (h, w, 3), and times that it is wider than it
     claims; ``shares``: the spread in px², of moving things that stand still, of wrong flow.
     """
-    odds, factor = np.empty(geometry[0].shape[:2], np.float32), np.empty(geometry[0].shape[:2], np.float32)
+    ratio, factor = np.empty(geometry[0].shape[:2], np.float32), np.empty(geometry[0].shape[:2], np.float32)
     spread, still_share, outlier_share = map(_F, shares)
-    _motion_terms(geometry, twist, (*noise[:2], _F(noise[2])), spread, odds, factor)
-    np.exp(odds, out=odds)
-    _odds_of(odds, factor, still_share, outlier_share)
-    return np.log(odds, out=odds)
+    _motion_terms(geometry, twist, (*noise[:2], _F(noise[2])), spread, ratio, factor)
+    np.exp(ratio, out=ratio)
+    _odds_of(ratio, factor, still_share, outlier_share)
+    return np.log(ratio, out=ratio)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _unlikely(square: Array, variance: Array, out: Array) -> None:
     for j in range(out.shape[0]):
         for i in range(out.shape[1]):
             out[j, i] = _F(-0.5) * max(square[j, i] / variance[j, i] - _F(2), _F(0))
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _joined(
     ratio: Array,
     masks: tuple[Array, Array, Array],

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
-from .motion import _JIT
-from .pixels import between_pixels
+from .pixels import JIT, between_pixels
 from .refinement import EdgeRefinement
 
 Array = NDArray[Any]
@@ -35,7 +34,7 @@ def kept_share(config: DynamicsConfig, small: Array, other: Array, to_other: Arr
     return np.exp(share, out=share)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _squared_difference(small: Array, other: Array, flow: Array, out: Array) -> None:
     """(small - other along the flow)²; outside of ``other`` it differs by far."""
     h, w = out.shape
@@ -59,7 +58,7 @@ def carried_along(log_odds: Array, flow: Array, kept: Array | None, memory: floa
     return out if kept is None else np.multiply(out, kept, out=out)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _carried_along(log_odds: Array, flow: Array, memory: float, out: Array) -> None:
     h, w = out.shape
     for j in range(h):
@@ -103,7 +102,7 @@ def _forgotten(config: DynamicsConfig) -> float:
     return 1 / max(config.temporal.memory, 1e-3) - 1
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _accumulated(
     carried: Array, fresh: Array, like: Array, holds: float, forgotten: float, gain: float, limit: float, out: Array
 ) -> None:

@@ -15,13 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
-from .config import DynamicsConfig
+from .pixels import JIT
 
 Array = NDArray[Any]
 _UNKNOWN_PX = 1e4  # wide enough to say nothing, small enough for float32 squares
 _F = np.float32
-_FINITE = {"contract", "arcp", "nsz"}  # fast, but a number that is not finite stays one
-_JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": _FINITE}
 Information = tuple[Array, Array, Array]  # xx, xy, yy, each (h, w) px^-2
 
 
@@ -46,7 +44,7 @@ def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Arr
     return RigidFlow(target, slope, xy, near, inside)
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _rigid(
     rays: Array, m: Array, lens: Array, inv: Array, target: Array, slope: Array, xy: Array, near: Array, inside: Array
 ) -> None:
@@ -97,7 +95,7 @@ def residual_twist(jacobian: Array, residual: Array, weight: Array, noise_px: fl
     return twist
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _twist_system(
     jacobian: Array, residual: Array, weight: Array, twist: Array, noise: float, scale: float
 ) -> tuple[Array, Array]:
@@ -139,7 +137,7 @@ def flow_covariance(information: Information, base_px: float, widest_px: float) 
     return out
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _covariance(xx: Array, xy: Array, yy: Array, base: float, floor: float, out: Array) -> None:
     for j in range(xx.shape[0]):
         for i in range(xx.shape[1]):
@@ -148,23 +146,23 @@ def _covariance(xx: Array, xy: Array, yy: Array, base: float, floor: float, out:
             out[j, i, 0], out[j, i, 1], out[j, i, 2] = c * share + base, -b * share, a * share + base
 
 
-@nb.njit(**_JIT)
-def _bounded(value: Any) -> Any:
+@nb.njit(**JIT)
+def bounded(value: Any) -> Any:
     """Without what is not finite, and within what float32 squares."""
     if math.isnan(value):
         return _F(_UNKNOWN_PX)
     return min(max(value, _F(-_UNKNOWN_PX)), _F(_UNKNOWN_PX))
 
 
-@nb.njit(**_JIT)
-def _widened(rx: Any, ry: Any, xx: Any, xy: Any, yy: Any, spread: Any) -> tuple[Any, Any]:
+@nb.njit(**JIT)
+def widened(rx: Any, ry: Any, xx: Any, xy: Any, yy: Any, spread: Any) -> tuple[Any, Any]:
     """p(r | cov + spread) / p(r | cov) of one pixel's residual, as (log of its exponential, its other factor).
 
     1 where a number is not finite.
     """
     if not math.isfinite(rx + ry + xx + xy + yy):
         return _F(0), _F(1)
-    x, y = float(_bounded(rx)), float(_bounded(ry))
+    x, y = float(bounded(rx)), float(bounded(ry))
     a, b, c = float(xx), float(xy), float(yy)  # along an epipolar line they are large, and det their small difference
     det = max(a * c - b * b, 1e-12)
     wide = max((a + spread) * (c + spread) - b * b, 1e-12)
@@ -173,34 +171,11 @@ def _widened(rx: Any, ry: Any, xx: Any, xy: Any, yy: Any, spread: Any) -> tuple[
     return _F(min(max(0.5 * length, -80.0), 80.0)), _F(math.sqrt(det / wide))
 
 
-@nb.njit(**_JIT)
-def _odds(widened: Any, still_share: Any, outlier_share: Any) -> Any:
+@nb.njit(**JIT)
+def odds(widened: Any, still_share: Any, outlier_share: Any) -> Any:
     """p(r | moving) / p(r | static) of one pixel, where the widened normal is ``widened`` times the static one."""
     one = _F(1)
     return (still_share + (one - still_share) * widened) / ((one - outlier_share) + outlier_share * widened)
-
-
-def motion_log_ratio(residual: Array, cov: Array, config: DynamicsConfig) -> Array:
-    """log p(residual | moving) - log p(residual | static), (h, w) float32.
-
-    Static: Normal(0, cov) with a share of wrong flow. Moving: the same widened by ``motion.spread_px``, and a share
-    that shows no motion against the background. Bounded on both sides by the shares, near 0 where cov is wide, and 0
-    where a number is not finite.
-    """
-    flat = (np.ascontiguousarray(v.reshape(-1, v.shape[-1]), _F) for v in (residual, cov))
-    shares = config.motion.spread_px**2, config.still_share, config.outlier_share
-    odds: Array = _all_odds(*flat, *map(_F, shares))
-    return np.log(odds).reshape(residual.shape[:-1])
-
-
-@nb.njit(**_JIT)
-def _all_odds(residual: Array, cov: Array, spread: float, still_share: float, outlier_share: float) -> Array:
-    out = np.ones(len(residual), np.float32)
-    for n in range(len(residual)):
-        log_part, factor = _widened(residual[n, 0], residual[n, 1], cov[n, 0], cov[n, 1], cov[n, 2], spread)
-        if not (log_part == 0 and factor == 1):
-            out[n] = _odds(factor * math.exp(log_part), still_share, outlier_share)
-    return out
 
 
 def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
@@ -215,14 +190,14 @@ def noise_inflation(residual: Array, cov: Array, weight: Array) -> float:
     return max(1.0, float(np.median(length)) / (2 * np.log(2)))
 
 
-@nb.njit(**_JIT)
+@nb.njit(**JIT)
 def _lengths(residual: Array, cov: Array, weight: Array) -> Array:
     """Squared Mahalanobis lengths of what is weighted and finite."""
     out, n = np.empty(len(residual)), 0
     for k in range(len(residual)):
         rx, ry, xx, xy, yy = residual[k, 0], residual[k, 1], cov[k, 0], cov[k, 1], cov[k, 2]
         if weight[k] > 0.5 and math.isfinite(rx + ry + xx + xy + yy):
-            rx, ry = float(_bounded(_F(rx))), float(_bounded(_F(ry)))
+            rx, ry = float(bounded(_F(rx))), float(bounded(_F(ry)))
             det = max(xx * yy - xy * xy, 1e-12)
             out[n] = (yy * rx * rx - 2 * xy * rx * ry + xx * ry * ry) / det
             n += 1

@@ -15,9 +15,9 @@ from ..concurrency import Worker
 from ..geometry.se3 import inverse
 from .comparison_kernels import (
     add_grey_evidence,
+    confident_share,
     flow_log_ratio,
     grey_differences,
-    matched_share,
     mean_ratio,
     round_trip_confidence,
     unexplained_every,
@@ -151,7 +151,7 @@ class MotionTest:
         c, rigid, left = self.config.motion, aligned.rigid, aligned.left
         twist = self._pose_error(rigid, left, confidence, static)
         covered = self._flow.warp(past.moving, rigid.target)
-        failed = 1 - matched_share(confidence, rigid.inside, static, covered) if c.doubts_unmatched else 0.0
+        failed = 1 - confident_share(confidence, rigid.inside, static, covered) if c.doubts_unmatched else 0.0
         geometry, sigma, cov = (left, rigid.xy, rigid.inv_depth, rigid.slope), frame.inv_depth_sigma, frame.flow_cov
         inflation = 1.0
         if c.noise_inflation:

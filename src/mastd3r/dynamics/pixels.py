@@ -1,4 +1,4 @@
-"""Images between their pixels, for kernels."""
+"""Images between their pixels, and how this stage's kernels are compiled."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 _F = np.float32
+FINITE = {"contract", "arcp", "nsz"}  # fast, but a number that is not finite stays one
+JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": FINITE}
 
 
-@nb.njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"}, inline="always")
+@nb.njit(inline="always", **JIT)
 def between_pixels(image: Array, u: Any, v: Any) -> Any:
     """``image`` (h, w) at column ``u`` and row ``v``, float32 within its outermost pixels, bilinear."""
     a, b = min(int(u), image.shape[1] - 2), min(int(v), image.shape[0] - 2)

@@ -106,8 +106,8 @@ def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
     near = solve_pose(known, guess, kernel_px=3.0).new_from_ref
     near = solve_pose(known, near, kernel_px=1.0).new_from_ref
     other = solve_pose(matches, near, kernel_px=1.0).new_from_ref
-    better = matches.cost(other, MOST_FIT_PX) < CLEARLY * matches.cost(pose, MOST_FIT_PX)
-    return other if better else pose
+    cost, cost_other = (matches.system(p, MOST_FIT_PX)[2] for p in (pose, other))
+    return other if cost_other < CLEARLY * cost else pose
 
 
 def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from ..types import FeatureMatches
+from .flow_maps import pixel_grid
 
 Array = NDArray[Any]
 NEIGHBOURS = 12  # features that the motion of a pixel is taken from
@@ -74,8 +75,7 @@ def dense_flow(features: FeatureMatches, width: int, height: int) -> Array:
     ref, new = (np.ascontiguousarray(p, np.float32) for p in (features.ref_px, features.new_px))
     found = cv2.findHomography(ref, new, cv2.RANSAC, HOMOGRAPHY_PX)[0]
     homography = np.eye(3) if found is None else found
-    x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    grid = np.stack([x, y], -1)
+    grid = pixel_grid(width, height)
     limit = 2.0 * max(width, height)
     moved = cv2.perspectiveTransform(grid.reshape(-1, 1, 2), homography).reshape(height, width, 2)
     base = np.clip(np.nan_to_num(moved - grid), -limit, limit)

@@ -137,10 +137,9 @@ def align_patches(
     """
     padded = np.zeros((len(weight), COLUMNS), np.float32)
     padded[:, : len(weight)] = weight
-    back = np.linalg.inv(affine)
 
     def some(s: slice) -> tuple[Array, Array]:
-        found: tuple[Array, Array] = _align(ref, new, px[s], start[s], back[s], padded.ravel(), iterations)
+        found: tuple[Array, Array] = _align(ref, new, px[s], start[s], affine[s], padded.ravel(), iterations)
         return found
 
     found = in_halves(some, len(px))
@@ -149,7 +148,7 @@ def align_patches(
 
 @nb.njit(**_JIT)
 def _align(
-    ref: Array, new: Array, px: Array, start: Array, back: Array, weight: Array, iterations: int
+    ref: Array, new: Array, px: Array, start: Array, affine: Array, weight: Array, iterations: int
 ) -> tuple[Array, Array]:
     p, q = px.shape[0], weight.shape[0] // COLUMNS
     r = q // 2
@@ -159,8 +158,11 @@ def _align(
     drawn = np.zeros((q + 3, COLUMNS), np.float32)  # the last row is never filled: what is read beyond has no weight
     value, seen = np.empty(q * COLUMNS, np.float32), np.empty(q * COLUMNS, np.float32)
     gx, gy = np.empty(q * COLUMNS, np.float32), np.empty(q * COLUMNS, np.float32)
+    b = np.empty((2, 2))  # d ref / d new
     for n in range(p):
-        b = back[n]
+        a = affine[n]
+        area = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+        b[0, 0], b[0, 1], b[1, 0], b[1, 1] = a[1, 1] / area, -a[0, 1] / area, -a[1, 0] / area, a[0, 0] / area
         reach_x = (r + 1) * (abs(b[0, 0]) + abs(b[0, 1])) + 0.01
         reach_y = (r + 1) * (abs(b[1, 0]) + abs(b[1, 1])) + 0.01
         if not (reach_x <= px[n, 0] < w - 1 - reach_x and reach_y <= px[n, 1] < h - 1 - reach_y):
