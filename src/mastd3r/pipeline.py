@@ -19,9 +19,8 @@ from .config import Config, check_config, config_from_yaml, config_to_yaml
 from .errors import InputError
 from .evaluation.evaluate import evaluate_trajectory as score
 from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
-from .export.read_run import read_json
 from .export.run_folder import RunFolder
-from .export.run_record import checked_record
+from .export.run_record import read_record
 from .export.trajectory_files import read_trajectory
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
@@ -93,7 +92,7 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
     stopped = stopped_run(path)
     if stopped is None:
         raise InputError(f"{path}: expected a run that was stopped, got {_what_is_in(path)}")
-    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
+    record = read_record(stopped)
     if record.get("live"):
         raise InputError(f"{stopped}: expected a run of files, got a live one; mastd3r finish goes on with its frames")
     read = record.get("source") or {}
@@ -111,18 +110,18 @@ def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconst
     Stopped, it goes on where it was. Raises InputError for a folder that holds no such run, or one that is finished;
     otherwise as ``reconstruct``.
     """
-    path = Path(run).expanduser()
-    if not (path / "run.json").is_file() and stopped_run(path) is None:
+    path = user_path(run)
+    if not is_file(path / "run.json") and stopped_run(path) is None:
         raise InputError(f"{path}: expected the folder of a live run, got {_what_is_in(path)}")
     at = stopped_run(path) or path
-    record = read_json(at / "run.json")
+    record = read_record(at)
     if not record.get("live"):
         raise InputError(f"{at}: expected a live run, got one of files; mastd3r resume goes on with those")
-    if not record["live"].get("recorded") or not (at / RECORDED / RECORDED_LIST).is_file():
+    if not record["live"].get("recorded") or not is_file(at / RECORDED / RECORDED_LIST):
         raise InputError(f"{at}: expected a live run that kept its frames (--record), got one that let them pass")
-    if record.get("status") == "complete" and "masks" in record.get("timings_s", {}):
+    if record.get("status") == "complete" and "masks" in (record.get("timings_s") or {}):
         raise InputError(f"{at}: expected a live run that is not finished, got a finished one; mastd3r map goes on")
-    if not (at / "config.yaml").is_file():
+    if not is_file(at / "config.yaml"):
         raise InputError(f"{at}: expected config.yaml beside the frames, got a run stopped before it")
     slam, _ = _slam_of(at / RECORDED, config_from_yaml(at / "config.yaml"), None)
     return _go_on(slam, at, reporter or Silent())
@@ -143,7 +142,7 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
     stopped = stopped_run(out) if out.is_dir() else None
     if stopped is None or not (stopped / CHECKPOINT).is_dir():
         return None
-    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
+    record = read_record(stopped)
     was = record.get("source") or {}
     config = stopped / "config.yaml"
     same = is_file(config) and whole_text(config, "YAML", most=MOST_YAML_BYTES) == config_to_yaml(slam.config)
@@ -152,7 +151,7 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
 
 def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
     """A stopped run, from its last good checkpoint."""
-    record = checked_record(read_json(stopped / "run.json"), stopped / "run.json")
+    record = read_record(stopped)
     ended_live = bool(record.get("live")) and record.get("status") == "complete"
     with RunFolder.going_on(stopped, record) as folder:
         if record.get("live"):

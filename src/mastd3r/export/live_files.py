@@ -8,9 +8,8 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.quaternion import quaternion_from_rotation
 from .files import writing
-from .trajectory_files import HEADER
+from .trajectory_files import HEADER, tum_rows
 
 Array = NDArray[Any]
 COLUMNS = "timestamp_s,state,keyframe,submap,dropped_before,pose_latency_ms,latency_ms,reason\n"
@@ -26,11 +25,8 @@ class LiveFiles:
 
     def pose(self, timestamp_s: float, world_from_cam: Array | None) -> None:
         """The pose (4, 4) of a frame as it was given out; none, no row. Raises OutputError."""
-        if world_from_cam is None or not np.isfinite(world_from_cam).all():
-            return
-        w, x, y, z = quaternion_from_rotation(world_from_cam[:3, :3])
-        numbers = " ".join(f"{v:.9f}" for v in (*world_from_cam[:3, 3], x, y, z, w))
-        self._row(self._poses, f"{timestamp_s:.6f} {numbers}\n")
+        if world_from_cam is not None and np.isfinite(world_from_cam).all():
+            self._row(self._poses, tum_rows(np.array([timestamp_s]), world_from_cam[None]))
 
     def frame(self, timestamp_s: float, *cells: object) -> None:
         """The other ``COLUMNS`` of a frame. Raises OutputError."""

@@ -19,7 +19,7 @@ from ..reading.yaml_text import MOST_YAML_BYTES
 from ..types import State, Trajectory
 from .claim import PICTURE
 from .run_folder import stamp
-from .run_record import checked_camera, checked_metrics, checked_record
+from .run_record import checked_camera, checked_metrics, read_record
 from .trajectory_files import read_tum
 
 Array = NDArray[Any]
@@ -61,7 +61,7 @@ def read_run(path: Path | str) -> Run:
     folder = Path(path)
     if not os.path.lexists(folder / "run.json"):
         raise InputError(f"{folder}: expected a run folder, got no run.json in it")
-    record = checked_record(read_json(folder / "run.json"), folder / "run.json")
+    record = read_record(folder)
     trajectory = _poses(folder / "trajectory.txt")
     if os.path.lexists(folder / "keyframes.txt"):
         times = {stamp(float(t)) for t in read_tum(folder / "keyframes.txt").timestamps_s}

@@ -75,6 +75,9 @@ RECORD: dict[str, tuple[Fits, str]] = {
     "camera.found": (text, "text"),
     "world": (mapping(), "an object"),
     "graph": (mapping(), "an object"),
+    "live": (mapping(), "an object"),
+    "live.recorded": (lambda v: isinstance(v, bool), "true or false"),
+    "live.figures": (mapping(number), "numbers by name"),
 }
 
 
@@ -87,6 +90,11 @@ def checked_record(record: dict[str, Any], path: Path) -> dict[str, Any]:
         if name in place and not fits(place[name]):
             raise InputError(f"{path} {key}: expected {expected}, got {short(repr(place[name]))}")
     return record
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """run.json of a run folder, checked. Raises InputError."""
+    return checked_record(whole_json(folder / "run.json"), folder / "run.json")
 
 
 def checked_metrics(path: Path) -> dict[str, Any]:

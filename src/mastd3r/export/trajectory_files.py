@@ -25,13 +25,16 @@ HEADER = "# timestamp_s tx ty tz qx qy qz qw (world_from_cam)\n"
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write every finite pose; a pose that is not finite has no row. Raises OutputError."""
     finite = np.isfinite(trajectory.world_from_cam).all((1, 2))
-    poses = trajectory.world_from_cam[finite]
-    wxyz = quaternion_from_rotation(poses[:, :3, :3])
-    lines = [
+    write_text(path, HEADER + tum_rows(trajectory.timestamps_s[finite], trajectory.world_from_cam[finite]))
+
+
+def tum_rows(times_s: Array, world_from_cam: Array) -> str:
+    """A line each of times (n,) and poses (n, 4, 4)."""
+    wxyz = quaternion_from_rotation(world_from_cam[:, :3, :3])
+    return "".join(
         f"{t:.6f} {p[0]:.9f} {p[1]:.9f} {p[2]:.9f} {q[1]:.9f} {q[2]:.9f} {q[3]:.9f} {q[0]:.9f}\n"
-        for t, p, q in zip(trajectory.timestamps_s[finite], poses[:, :3, 3], wxyz, strict=True)
-    ]
-    write_text(path, HEADER + "".join(lines))
+        for t, p, q in zip(times_s, world_from_cam[:, :3, 3], wxyz, strict=True)
+    )
 
 
 def read_tum(path: Path, state: State = "tracked") -> Trajectory:

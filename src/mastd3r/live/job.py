@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any
 
@@ -54,10 +55,7 @@ class LiveJob(RunJob):
 
     def latency_ms(self) -> tuple[float, float]:
         """Median and 95 % of the milliseconds from a frame's arrival until pose and mask are out; nan before any."""
-        if not self.latencies_s:
-            return np.nan, np.nan
-        median, most = np.percentile([both for _, both in list(self.latencies_s)], (50, 95))
-        return 1e3 * float(median), 1e3 * float(most)
+        return _median_and_most_ms([both for _, both in list(self.latencies_s)])
 
     def settle(self) -> None:
         """Wait for the files of all frames. Raises OutputError."""
@@ -110,10 +108,9 @@ class LiveJob(RunJob):
             figures |= {"live_s": seconds, "fps_camera": (loop.came - 1) / seconds}
             figures["fps_live"] = (len(arrived) - 1) / seconds
         if self.latencies_s:
-            pose, both = 1e3 * np.array(self.latencies_s).T
+            pose, both = zip(*self.latencies_s, strict=True)
             for name, values in (("latency_ms", both), ("pose_latency_ms", pose)):
-                median, most = np.percentile(values, (50, 95))
-                figures |= {f"{name}_median": float(median), f"{name}_95": float(most)}
+                figures[f"{name}_median"], figures[f"{name}_95"] = _median_and_most_ms(values)
         return figures
 
     def _write(self, seen: LiveFrame) -> None:
@@ -159,3 +156,11 @@ class LiveJob(RunJob):
             if error is not None and self.folder.record["status"] == "running":
                 self.folder.record["live"] = self.facts()
             super().__exit__(kind, error, trace)
+
+
+def _median_and_most_ms(latencies_s: Sequence[float]) -> tuple[float, float]:
+    """Median and 95 % in milliseconds; nan of none."""
+    if not latencies_s:
+        return np.nan, np.nan
+    median, most = 1e3 * np.percentile(latencies_s, (50, 95))
+    return float(median), float(most)

@@ -18,6 +18,7 @@ from ..export.claim import RECORDED
 from ..export.run_folder import RunFolder
 from ..offline.reconstruction import Reconstruction
 from ..progress import Bar, Reporter, Silent
+from ..reading.files import user_path
 from ..sources.camera import CameraOptions, open_camera
 from ..sources.passing import KeptSource, PassingSource
 from ..types import StaticCloud
@@ -26,6 +27,7 @@ from .loop import LiveFrame, LiveLoop
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+LATENCY_EVERY_S = 1.0  # how late frames are is said anew no more often
 CLOUD_EVERY_S = 1.0  # a view gets the cloud no more often
 
 
@@ -73,9 +75,9 @@ def run_live(
         loop = LiveLoop(opened, config, source=source, seconds=seconds)
         bar.advance()
     with loop:
-        path = Path(camera).expanduser()
+        path = user_path(camera)
         read = [path] if path.exists() and not path.is_char_device() else []
-        with RunFolder(Path(out).expanduser(), list(command), read, overwrite=overwrite) as folder:
+        with RunFolder(user_path(out, "out"), list(command), read, overwrite=overwrite) as folder:
             where = str((folder.home / RECORDED).resolve()) if record else opened.name
             folder.update(source={"path": where, "maps": None}, live={"recorded": record})
             if isinstance(source, KeptSource):
@@ -110,6 +112,7 @@ class _Teller:
     def __init__(self, loop: LiveLoop, job: LiveJob, bar: Bar, view: LiveView | None) -> None:
         self._loop, self._job, self._bar, self._view = loop, job, bar, view
         self._said, self._keyframes, self._cloud_at = 0, 0, 0.0
+        self._late, self._late_at = "", -LATENCY_EVERY_S
 
     def frame(self, seen: LiveFrame) -> None:
         """One more."""
@@ -130,7 +133,9 @@ class _Teller:
         for line in loop.said[self._said :]:
             log.warning(line)
         self._said = len(loop.said)
-        median, most = self._job.latency_ms()
-        late = "" if np.isnan(median) else f" · latency {median:.0f} ms (95 %: {most:.0f})"
+        if time.monotonic() - self._late_at >= LATENCY_EVERY_S:  # it goes through all frames that there were
+            median, most = self._job.latency_ms()
+            self._late = "" if np.isnan(median) else f" · latency {median:.0f} ms (95 %: {most:.0f})"
+            self._late_at = time.monotonic()
         share = loop.dropped / max(loop.came, 1)
-        self._bar.say(f"{loop.state}{late} · dropped {loop.dropped} of {loop.came} ({share:.1%})")
+        self._bar.say(f"{loop.state}{self._late} · dropped {loop.dropped} of {loop.came} ({share:.1%})")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import ConfigError, InputError
+from ..reading.files import user_path
 
 Array = NDArray[Any]
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
@@ -88,7 +89,7 @@ def open_camera(what: str | Path, options: CameraOptions, source: SourceConfig |
         _refuse(options, words, "topic", "pace_fps")
         return StreamCamera(words, options)
     _refuse(options, words, "reconnect_s")
-    path = Path(words).expanduser()
+    path = user_path(words)
     if not path.exists():
         raise InputError(f"{words}: expected {EXPECTED}, or a video or folder to play, got no such path")
     from .ros_bag import RosBag, is_bag

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from numpy.typing import NDArray
 
-from ..config import SourceConfig, config_from_dict
-from ..errors import ConfigError, InputError, SlamError
+from ..config import SourceConfig, config_from_text
+from ..errors import InputError, SlamError
 from ..export.read_run import Run
 from ..export.run_folder import stamp
 
@@ -77,10 +76,7 @@ class Pictures:
 
     def _source_config(self) -> SourceConfig:
         """The window and kind that the run read its source with. Raises ConfigError."""
-        try:
-            return config_from_dict(yaml.safe_load(self._run.config) or {}).source
-        except yaml.YAMLError as e:
-            raise ConfigError(f"{self._run.path}/config.yaml: expected readable YAML, got {e}") from e
+        return config_from_text(self._run.config, f"{self._run.path}/config.yaml").source
 
     @staticmethod
     def _video_from(path: Path, first_s: float) -> ImageAt:

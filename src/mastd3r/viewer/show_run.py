@@ -18,6 +18,7 @@ from ..export.run_folder import stamp
 from ..export.trajectory_files import read_states
 from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
+from ..reading.files import whole_bytes
 from ..types import State
 from .pictures import Pictures
 from .scene import Scene
@@ -105,7 +106,7 @@ def read_content(path: Path, files: Sequence[Path] = ()) -> Content:
     here = [path / name for name in (DENSE, *MESHES) if (path / name).is_file()]
     for file in [*here, *files]:
         if is_glb(file):
-            content.mesh = file.read_bytes()
+            content.mesh = whole_bytes(file, "a readable mesh")
         elif has_faces(file):
             content.mesh = glb_bytes(*read_mesh(file))
         else:
