@@ -66,7 +66,6 @@ def test_the_result_does_not_depend_on_how_long_edges_take(
     assert {(e.i, e.j) for e in first.slam.graph.edges} == {(e.i, e.j) for e in second.slam.graph.edges}
 
 
-@pytest.mark.slow
 def test_where_keyframes_follow_one_another_they_are_connected_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     made_where = watched(monkeypatch, 0.0)
     run = play(views_of(36, turning_fast))

@@ -157,6 +157,20 @@ def test_the_classifier_takes_features_of_any_kind_and_knows_what_it_does_not_kn
     assert classifier.log_odds(np.zeros((4, 4, 7), np.float32)) is None  # other features than those it learned
 
 
+def test_four_cells_of_fine_features_are_answered_together() -> None:
+    rng = np.random.default_rng(5)
+    classifier, moves = AppearanceClassifier(DynamicsConfig()), np.arange(48) > 30
+    coarse = (rng.normal(size=(36, 48, 11)) + 3 * moves[:, None]).astype(np.float32)
+    for _ in range(8):
+        classifier.learn(coarse, np.tile(np.where(moves, 5.0, -5.0), (36, 1)))
+    fine = (
+        np.repeat(np.repeat(coarse, 2, 0), 2, 1) + np.tile(np.float32([[0.1, -0.1], [-0.1, 0.1]]), (36, 48))[..., None]
+    )
+    apart, together = classifier.log_odds(coarse), classifier.log_odds(fine)
+    assert apart is not None and together is not None and together.shape == (36, 48)
+    np.testing.assert_allclose(together, apart, atol=1e-4)
+
+
 def test_a_classifier_that_saw_nothing_move_has_no_say() -> None:
     classifier = AppearanceClassifier(DynamicsConfig())
     for i in range(10):

@@ -152,6 +152,9 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
         "peak_rss_mib", "focal_px", "psnr_holdout_white", "psnr_holdout_fitted", "opaque_holdout",
     ):  # fmt: skip
         assert isinstance(metrics[key], int | float) and np.isfinite(metrics[key]), key
+    record = json.loads((out / "run.json").read_text())
+    assert record["processor_s"].keys() == record["timings_s"].keys()
+    assert 0 < metrics["core_s_per_frame_tracking"] < metrics["core_s_per_frame"]
     assert {p.name for p in (out / "alpha").iterdir()} == holdout and metrics["opaque_holdout"] > 0.5
     assert metrics["psnr_holdout"] > 12 and metrics["psnr_mapped"] > 12
     what_is_shown_of_a_map(out, holdout, tmp_path)
@@ -166,7 +169,6 @@ def test_a_small_map(room_clip: Path, tmp_path: Path) -> None:
     assert file_alone["opaque"] == pytest.approx(metrics["opaque_holdout"], abs=0.03) and file_alone["near"] < 0.02
 
 
-@pytest.mark.slow
 @pytest.mark.usefixtures("short_flight")
 def test_refined_poses_are_those_of_the_trajectory(room_clip: Path, tmp_path: Path) -> None:
     """Where training moves the cameras, every frame is placed in the map, and the file is judged from there."""

@@ -72,7 +72,7 @@ def ended_by(name: str, process: subprocess.Popen[bytes], out: Path) -> None:
     assert all(state.startswith("Z") for state in alive.stdout.split()), alive.stdout
 
 
-@pytest.mark.parametrize("name", ["SIGTERM", *(pytest.param(n, marks=pytest.mark.slow) for n in ("SIGINT", "SIGHUP"))])
+@pytest.mark.parametrize("name", ENDS)
 def test_a_signal_ends_a_run_as_ctrl_c_does(name: str, room_clip: Path, tmp_path: Path) -> None:
     """While the masks are made: every frame has its pose."""
     process = start_run(room_clip, tmp_path / "run", "--no-map", "--end", "16", slow_masks=True)

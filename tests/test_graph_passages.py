@@ -98,7 +98,6 @@ def test_a_short_chain_has_no_passages(exact_scene: Callable[..., Any]) -> None:
     assert VIEWS >= 2 * LENGTH > 5 and doubtful_passages(graph) == [] and retake_passages(graph) == 0
 
 
-@pytest.mark.slow
 def test_the_same_passage_in_another_world_and_scale_changes_nothing(exact_scene: Callable[..., Any]) -> None:
     graph = chain(exact_scene)
     before = {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
@@ -114,7 +113,6 @@ def test_the_same_passage_in_another_world_and_scale_changes_nothing(exact_scene
         np.testing.assert_allclose(graph.variables[k].inv_depth, inv_depth, rtol=1e-9)
 
 
-@pytest.mark.slow
 def test_measured_depths_have_a_scale_that_is_not_ours_to_change(exact_scene: Callable[..., Any]) -> None:
     graph = chain(exact_scene)
     break_up(graph)

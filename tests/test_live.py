@@ -145,7 +145,6 @@ def poses(rec: mastd3r.Reconstruction) -> Trajectory:
     return Trajectory(rec.timestamps_s, rec.poses, rec.states, rec.is_keyframe)
 
 
-@pytest.mark.slow
 def test_what_was_kept_is_finished_as_a_run_over_it(
     room_clip: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

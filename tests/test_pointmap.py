@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mastd3r.camera.pinhole import Camera
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.pointmap.flow import FlowMatcher, corner_grid
+from mastd3r.pointmap.flow_maps import resized_flow
 from mastd3r.pointmap.geometric import GeometricPointmaps, SensorDepthPointmaps, sample_own, working_size
 from mastd3r.sources.synthetic import SyntheticView, room_camera
 from mastd3r.types import Frame, Guess
@@ -60,11 +61,13 @@ def pair_of(matrix: Array, shift: Array) -> tuple[Array, Array, Callable[[Array]
     return ref, new, lambda px: (px - CENTRE) @ matrix.T + CENTRE + shift
 
 
-def error_px(matcher: FlowMatcher, pair: tuple, start: Array | None = None) -> tuple[float, float, float]:
+def error_px(
+    matcher: FlowMatcher, pair: tuple, start: Array | None = None, near: bool = False
+) -> tuple[float, float, float]:
     """Median and 95th percentile of the error of the believed matches, and their share of those in view."""
     ref, new, where = pair
     px, _ = corner_grid(ref, 10)
-    found = matcher.match(ref, new, px, start)
+    found = matcher.match(ref, new, px, start, near=near)
     truth = where(px)
     visible = np.ones(len(px), bool)
     for at in (px, truth):  # a match's window must lie in both pictures
@@ -103,6 +106,26 @@ def test_flow_with_a_turning_start() -> None:
     start = (pair[2](GRID) - GRID).astype(np.float32)
     median, _, share = error_px(FlowMatcher(WIDTH, HEIGHT), pair, start)
     assert median < 0.1 and share > 0.8
+
+
+@pytest.mark.parametrize("start_size", [(HEIGHT, WIDTH), (HEIGHT // 2, WIDTH // 2)])
+def test_near_flow_of_large_images_is_found_at_half_their_size(
+    start_size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The start is 2 px off. It may be of either size; matches are as good as those from flow of the whole size."""
+    matrix, shift = turned(np.deg2rad(5), 1.03), np.array([31.4, -7.3])
+    pair = pair_of(matrix, shift)
+    start = resized_flow((pair[2](GRID) - GRID + 1.5).astype(np.float32), start_size[1], start_size[0])
+    matcher = FlowMatcher(WIDTH, HEIGHT)
+    assert matcher.dense(*pair[:2], start, near=True).shape == (HEIGHT, WIDTH, 2)  # these images are small
+    monkeypatch.setattr("mastd3r.pointmap.flow.LARGE_PX", WIDTH * HEIGHT)
+    half = matcher.dense(*pair[:2], start, near=True)
+    assert half.shape == (HEIGHT // 2, WIDTH // 2, 2)
+    inner = np.s_[20:-20, 40:-40]
+    error = np.linalg.norm(resized_flow(half, WIDTH, HEIGHT) - (pair[2](GRID) - GRID), axis=-1)[inner]
+    assert np.median(error) < 0.5
+    median, p95, share = error_px(matcher, pair, start, near=True)
+    assert median < 0.1 and p95 < 0.4 and share > 0.8
 
 
 def test_pictures_without_anything_in_common_do_not_match() -> None:

@@ -231,7 +231,7 @@ MOMENTS: dict[str, tuple[Callable[[Path], bool], str]] = {
 }
 
 
-@pytest.mark.parametrize("moment", ["tracking", "masks", pytest.param("the first moment", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("moment", MOMENTS)
 def test_a_killed_run_goes_on_and_ends_as_if_it_had_not_been(
     moment: str, room_clip: Path, undisturbed: Path, tmp_path: Path
 ) -> None:

@@ -14,6 +14,7 @@ from mastd3r.geometry.se3 import inverse, so3_log
 from mastd3r.parts import parts_of
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
+from mastd3r.tracking.two_view import Start
 from mastd3r.types import FeatureMatches, Frame, Guess
 from test_pointmap import pair_of
 from test_pointmap_mast3r import FULL, WORK, TrueNetwork, photograph, provider_of
@@ -76,7 +77,7 @@ def test_where_few_match_features_are_asked_and_the_better_start_is_kept() -> No
     for name, moved in (("none", None), ("true", [-80, 8]), ("wrong", [60, -60])):
         parts.features = Given(moved)  # type: ignore[assignment]
         work = parts.provider.observe(Frame(1, 0.1, np.dstack([new] * 3)))
-        nothing = np.zeros((240, 320, 2), np.float32)  # where a slow camera would be
+        nothing = Start(np.zeros((240, 320, 2), np.float32))  # where a slow camera would be
         matched[name] = slam.two_view.estimate(keyframe, work, still, nothing, np.eye(4)).matched
     assert parts.features.asked == 1  # type: ignore[attr-defined]
     assert matched["none"] == matched["wrong"] < 0.3 * matched["true"]
@@ -93,7 +94,7 @@ def test_before_a_start_what_passes_in_front_makes_no_keyframe() -> None:
     slam = Slam(Config(semantics="none"), (320, 240), parts=parts)
     slam.track(Frame(0, 0.0, np.dstack([ref] * 3)))
     keyframe, work = slam.graph.keyframes[0], parts.provider.observe(Frame(1, 0.1, np.dstack([new] * 3)))
-    still, nothing = Future.done(np.zeros((240, 320), np.float32)), np.zeros((240, 320, 2), np.float32)
+    still, nothing = Future.done(np.zeros((240, 320), np.float32)), Start(np.zeros((240, 320, 2), np.float32))
     motion = []
     for started in (set(), {0}):
         slam.graph.started = started

@@ -134,7 +134,9 @@ class CovisibilityEdges:
         far = far_matches(self.parts, ref, new.work, moving)
         if far is None:
             return None
-        pair = self.parts.provider.predict(ref.work, new.work, Guess(graph.camera(), flow=far[0], features=far[1]))
+        pair = self.parts.provider.predict(
+            ref.work, new.work, Guess(graph.camera(), flow=far.flow, features=far.features)
+        )
         if not graph.initialised:
             self.flows[i, j] = pair.flow
         return graph.edge(i, j, pair.matches, static_at(moving, pair.matches.new_px))

@@ -24,7 +24,7 @@ from .depth_prior import own_depth_prior, predicted_depth
 from .joining import join_recognised
 from .observation import Observation
 from .state import TrackedFrame, TrackingState, status_in
-from .two_view import TwoView, TwoViewEstimator, matched_share
+from .two_view import Start, TwoView, TwoViewEstimator, matched_share
 
 Array = NDArray[Any]
 EDGES_AFTER = 4  # frames after a keyframe until its edges are taken: at the same frame however fast they were made
@@ -102,8 +102,8 @@ class Keyframes:
         if near is None:
             return None
         kf, guess = graph.keyframes[near], cam_from_world @ inverse(graph.variables[near].cam_from_world)
-        flow = rigid_flow_to(graph, near, cam_from_world)
-        view = self.two_view.estimate(kf, last.work, last.moving, flow, guess, near=True)
+        start = Start(rigid_flow_to(graph, near, cam_from_world), near=True)
+        view = self.two_view.estimate(kf, last.work, last.moving, start, guess)
         nearby = view.motion_ratio <= t.keyframe_motion_ratio
         if not self.two_view.accepted(view) or not nearby or matched_share(kf, view.weight) < KNOWN_PLACE_MATCHED:
             return None
@@ -137,8 +137,8 @@ class Keyframes:
         """The last frame that was tracked becomes a keyframe, which is followed from here on."""
         anchor, last = state.anchor, state.last
         assert anchor is not None and last is not None
-        guess = state.cam_from_anchor
-        view = self.two_view.estimate(anchor, last.work, last.moving, state.flow, guess, near=True)
+        start = Start(state.flow, near=True)
+        view = self.two_view.estimate(anchor, last.work, last.moving, start, state.cam_from_anchor)
         return self._add(state, view)
 
     def _add(self, state: TrackingState, view: TwoView) -> TrackingState:
@@ -223,8 +223,8 @@ class Keyframes:
         if last is not None:
             last.moving.get()
         if last is not None and state.flow is not None and state.anchor is not None:
-            guess = state.cam_from_anchor
-            view = self.two_view.estimate(state.anchor, last.work, last.moving, state.flow, guess, near=True)
+            start = Start(state.flow, near=True)
+            view = self.two_view.estimate(state.anchor, last.work, last.moving, start, state.cam_from_anchor)
             t = self.config.tracking
             enough = LAST_MOTION * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
             if self.two_view.accepted(view) and view.motion_ratio > enough:

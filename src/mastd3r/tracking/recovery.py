@@ -17,7 +17,7 @@ from .keyframes import Keyframes
 from .observation import Observation
 from .places import believed, candidates
 from .state import Status, TrackingState, status_in
-from .two_view import THIN, TwoView, TwoViewEstimator, matched_share
+from .two_view import THIN, Start, TwoView, TwoViewEstimator, matched_share
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class Recovery:
             return state, None
         state = self.keyframes.promote_last(state)
         assert state.anchor is not None
-        near = self.two_view.estimate(state.anchor, work, prior, None, np.eye(4))
+        near = self.two_view.estimate(state.anchor, work, prior, Start(), np.eye(4))
         return state, near if self.two_view.accepted(near) else None
 
     def _rejoin(

@@ -23,10 +23,18 @@ from .observation import Observation
 from .state import TrackingState
 
 Array = NDArray[Any]
-Far = FeatureMatches | None
 SURE_INLIERS = 0.75  # of dense matches alone
 SURE_FEATURES, SURE_INLIERS_WITH = 80, 0.5  # or so many sparse features of one geometry, beside such a share
 THIN = 0.3  # share of a keyframe's static points that are matched, below: another start is tried
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the matches of a pair are searched from."""
+
+    flow: Array | None = None  # (h', w', 2) ref -> new; None: nothing is known
+    features: FeatureMatches | None = None  # where the flow comes from sparse features
+    near: bool = False  # the flow is within the motion of one frame
 
 
 @dataclass(frozen=True)
@@ -51,36 +59,29 @@ class TwoViewEstimator:
         """The frame against the keyframe that is followed, eq. (5)-(7), from where the last frame was."""
         if state.anchor is None or seen.blank:
             return AlignmentProblem.nothing(state.cam_from_anchor)
-        ref = state.anchor
-        return self.problem(ref, seen.work, prior, state.flow, state.cam_from_anchor, near=self._started(ref))
+        return self.problem(state.anchor, seen.work, prior, Start(state.flow, near=True), state.cam_from_anchor)
 
     def problem(
-        self,
-        ref: Keyframe,
-        new: WorkFrame,
-        prior: Future[Array],
-        flow: Array | None,
-        guess: Array,
-        far: Far = None,
-        *,
-        near: bool = False,
+        self, ref: Keyframe, new: WorkFrame, prior: Future[Array], start: Start, guess: Array
     ) -> AlignmentProblem:
-        """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``flow`` (h, w, 2) start ref -> new,
-        from the sparse features ``far`` or, ``near``, within the motion of one frame; ``guess`` (4, 4) new_from_ref."""
+        """``prior`` (h, w) P(moving) in new, which is waited for after matching; ``guess`` (4, 4) new_from_ref."""
         graph, started = self.graph, self._started(ref)
         variables = graph.variables[ref.id]
         inv_depth, info = (variables.inv_depth, graph.depth_info(ref.id)) if started else (None, None)
-        known = Guess(graph.camera(), inv_depth, info, guess if started else None, flow_is_near=near)
+        known = Guess(graph.camera(), inv_depth, info, guess if started else None)
 
-        def matched(start: Array | None, features: FeatureMatches | None = None) -> tuple[PairPrediction, Array]:
-            how = replace(known, flow=start, features=features)
+        def matched(start: Start) -> tuple[PairPrediction, Array]:
+            # before there is structure nothing else tells right from wrong: flow is searched at its full size
+            near = start.near and started
+            how = replace(known, flow=start.flow, features=start.features, flow_is_near=near)
             pair = self.parts.provider.predict(ref.work, new, how)  # (7): pointmap/geometric.py
             # (5)(6), softly: a match weighs as much as both its ends are static
             return pair, pair.matches.weight * ref.static * static_at(prior.get(), pair.matches.new_px)
 
-        pair, weight = matched(flow, far)
-        if far is None and matched_share(ref, weight) < THIN and (found := self._far(ref, new, prior)) is not None:
-            pair, weight = max((pair, weight), matched(*found), key=lambda found: float(found[1].sum()))
+        pair, weight = matched(start)
+        is_thin = start.features is None and matched_share(ref, weight) < THIN
+        if is_thin and (found := self._far(ref, new, prior)) is not None:
+            pair, weight = max((pair, weight), matched(found), key=lambda found: float(found[1].sum()))
         sigma = self.parts.provider.depth_sigma_ratio
         if not started:
             return AlignmentProblem(pair, weight, None, guess, sigma)
@@ -97,19 +98,9 @@ class TwoViewEstimator:
         motion = _motion(problem.pair.matches, problem.weight, self.parts.provider.size, share)
         return TwoView(ref, problem.pair, problem.weight, alignment, *motion)
 
-    def estimate(
-        self,
-        ref: Keyframe,
-        new: WorkFrame,
-        prior: Future[Array],
-        flow: Array | None,
-        guess: Array,
-        far: Far = None,
-        *,
-        near: bool = False,
-    ) -> TwoView:
+    def estimate(self, ref: Keyframe, new: WorkFrame, prior: Future[Array], start: Start, guess: Array) -> TwoView:
         """``problem``, and its coarse, scale and fine stage in order."""
-        problem = self.problem(ref, new, prior, flow, guess, far, near=near)
+        problem = self.problem(ref, new, prior, start, guess)
         view = self.view(ref, problem, align(self.parts.aligner, problem))
         assert view is not None
         return view
@@ -124,10 +115,10 @@ class TwoViewEstimator:
 
         A provider that finds what is far needs no start; for the others sparse features give one.
         """
-        start, features = self._far(kf, work, prior) or (None, None)
+        start = self._far(kf, work, prior)
         if start is None and not self.parts.provider.finds_far:
             return None
-        view = self.estimate(kf, work, prior, start, np.eye(4), features)
+        view = self.estimate(kf, work, prior, start or Start(), np.eye(4))
         return view if self.accepted(view) else None
 
     def beyond_doubt(self, view: TwoView, work: WorkFrame, prior: Future[Array]) -> bool:
@@ -139,23 +130,23 @@ class TwoViewEstimator:
         if ratio >= SURE_INLIERS or ratio < SURE_INLIERS_WITH:
             return ratio >= SURE_INLIERS
         far = self._far(view.anchor, work, prior)
-        return far is not None and len(far[1].ref_px) >= SURE_FEATURES
+        return far is not None and far.features is not None and len(far.features.ref_px) >= SURE_FEATURES
 
     def _started(self, ref: Keyframe) -> bool:
         return self.graph.submap_of[ref.id] in self.graph.started
 
-    def _far(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> tuple[Array, FeatureMatches] | None:
+    def _far(self, kf: Keyframe, work: WorkFrame, prior: Future[Array]) -> Start | None:
         """Sparse features of the static scene, and flow from them; None where none are needed, or too few agree."""
         return far_matches(self.parts, kf, work, prior.get())
 
 
-def far_matches(parts: Parts, kf: Keyframe, work: WorkFrame, moving: Array) -> tuple[Array, FeatureMatches] | None:
+def far_matches(parts: Parts, kf: Keyframe, work: WorkFrame, moving: Array) -> Start | None:
     """Sparse features of the static scene in both, and flow from them; None where none are needed, or too few agree."""
     if parts.provider.finds_far:
         return None
     found = parts.features.matches(kf.work.gray, work.gray, kf.moving / 255.0, moving)
     features = None if found is None else usable(found, *parts.provider.size)
-    return None if features is None else (dense_flow(features, *parts.provider.size), features)
+    return None if features is None else Start(dense_flow(features, *parts.provider.size), features)
 
 
 def matched_share(ref: Keyframe, weight: Array) -> float:
