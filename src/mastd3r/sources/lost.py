@@ -71,7 +71,7 @@ class Reconnecting:
                     if self._closed.is_set():
                         return
                     if (image.shape[1], image.shape[0]) != self.size:
-                        self.said.append(_changed(self.name, self.size, image))
+                        self.said.append(changed(self.name, self.size, image))
                         return
                     first = arrived if first is None else first
                     if own_s is not None and own_first_s is None:
@@ -132,6 +132,7 @@ class Reconnecting:
         return None
 
 
-def _changed(name: str, size: tuple[int, int], image: Array) -> str:
+def changed(name: str, size: tuple[int, int], image: Array) -> str:
+    """What is said of a camera of ``size`` (width, height) that gives ``image`` (h, w, 3)."""
     height, width = image.shape[:2]
     return f"{name}: frames changed from {size[0]}x{size[1]} to {width}x{height}: another lens needs another run"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError, MissingPackage
 from .camera import CameraFrame, CameraOptions
+from .lost import changed
 from .paced import paced
 
 Array = NDArray[Any]
@@ -62,12 +63,8 @@ class RosBag:
     def frames(self) -> Iterator[CameraFrame]:
         """Frame after frame. Raises InputError for an image that cannot be read; one of another size ends it."""
         for frame in paced(self._images(), self._fps):
-            height, width = frame.image.shape[:2]
-            if (width, height) != self.size:
-                self.said.append(
-                    f"{self.name}: frames changed from {self.size[0]}x{self.size[1]} to {width}x{height}: another "
-                    "lens needs another run"
-                )
+            if (frame.image.shape[1], frame.image.shape[0]) != self.size:
+                self.said.append(changed(self.name, self.size, frame.image))
                 return
             yield frame
 
