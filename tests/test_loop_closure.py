@@ -20,6 +20,7 @@ from mastd3r.graph.covisibility import overlap, overlaps
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
+from mastd3r.tracking import two_view
 from mastd3r.tracking.joining import join_recognised
 from mastd3r.tracking.loop_closure import add_covisible_pairs, close_loops
 from mastd3r.tracking.places import TURN_AT_ONCE, plausible_turn
@@ -302,12 +303,16 @@ def test_what_only_looks_alike_is_not_believed(scene: Any, spoilt: dict[str, flo
     ("inliers", "features", "sure"),
     [(0.8, 0, True), (0.6, 100, True), (0.6, 60, False), (0.6, 0, False), (0.4, 200, False)],
 )
-def test_doubt_is_dispelled_by_dense_matches_or_by_features(inliers: float, features: int, sure: bool) -> None:
+def test_doubt_is_dispelled_by_dense_matches_or_by_features(
+    monkeypatch: pytest.MonkeyPatch, inliers: float, features: int, sure: bool
+) -> None:
     view: Any = SimpleNamespace(anchor=None, alignment=SimpleNamespace(inlier_ratio=inliers))
     px = np.zeros((features, 2))
-    far = (None, FeatureMatches(px, px, np.ones(features))) if features else None
-    estimator: Any = SimpleNamespace(_far=lambda *_: far)
-    assert SURE_FEATURES == 80 and TwoViewEstimator.beyond_doubt(estimator, view, None, None) == sure  # type: ignore[arg-type]
+    far = FeatureMatches(px, px, np.ones(features)) if features else None
+    monkeypatch.setattr(two_view, "far_features", lambda *_: far)
+    estimator: Any = SimpleNamespace(parts=None)
+    prior: Any = SimpleNamespace(get=lambda: None)
+    assert SURE_FEATURES == 80 and TwoViewEstimator.beyond_doubt(estimator, view, None, prior) == sure  # type: ignore[arg-type]
 
 
 def test_a_camera_does_not_turn_round_from_one_frame_to_the_next(scene: Any) -> None:

@@ -129,8 +129,8 @@ class TwoViewEstimator:
         ratio = view.alignment.inlier_ratio
         if ratio >= SURE_INLIERS or ratio < SURE_INLIERS_WITH:
             return ratio >= SURE_INLIERS
-        far = self._far(view.anchor, work, prior)
-        return far is not None and far.features is not None and len(far.features.ref_px) >= SURE_FEATURES
+        features = far_features(self.parts, view.anchor, work, prior.get())
+        return features is not None and len(features.ref_px) >= SURE_FEATURES
 
     def _started(self, ref: Keyframe) -> bool:
         return self.graph.submap_of[ref.id] in self.graph.started
@@ -141,12 +141,17 @@ class TwoViewEstimator:
 
 
 def far_matches(parts: Parts, kf: Keyframe, work: WorkFrame, moving: Array) -> Start | None:
-    """Sparse features of the static scene in both, and flow from them; None where none are needed, or too few agree."""
+    """``far_features``, and flow from them."""
+    features = far_features(parts, kf, work, moving)
+    return None if features is None else Start(dense_flow(features, *parts.provider.size), features)
+
+
+def far_features(parts: Parts, kf: Keyframe, work: WorkFrame, moving: Array) -> FeatureMatches | None:
+    """Sparse features of the static scene in both; None where none are needed, or too few agree."""
     if parts.provider.finds_far:
         return None
     found = parts.features.matches(kf.work.gray, work.gray, kf.moving / 255.0, moving)
-    features = None if found is None else usable(found, *parts.provider.size)
-    return None if features is None else Start(dense_flow(features, *parts.provider.size), features)
+    return None if found is None else usable(found, *parts.provider.size)
 
 
 def matched_share(ref: Keyframe, weight: Array) -> float:
