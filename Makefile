@@ -10,7 +10,7 @@ STAMP := $(VENV)/.stamp
 .PHONY: help setup demo test lint format bench fuzz docs clean
 
 help:
-	@echo "make setup   create $(VENV) and install the package with its test tools"
+	@echo "make setup   create $(VENV), install the package with its test tools, compile its kernels"
 	@echo "make demo    the whole job on a small clip, into runs/demo"
 	@echo "make test    lint, types and tests"
 	@echo "make lint    ruff and mypy only"
@@ -26,6 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("expected Python 3.11 or newer, got " + sys.version.split()[0] + "; name another one: make setup PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -c constraints.txt -e '.[test]'
+	$(BIN)/mastd3r compile
 	@touch $(STAMP)
 
 demo: setup

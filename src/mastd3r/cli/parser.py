@@ -16,6 +16,7 @@ from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
 from .bench import bench_parser
+from .compile import PARTS, compile_kernels
 from .download import download_parser
 from .live import finish_parser, live_parser
 from .options import path
@@ -88,6 +89,9 @@ def parser() -> argparse.ArgumentParser:
     bench_parser(known.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(known.add_parser("weights", help="list, download and check the weights of the networks"))
     download_parser(known.add_parser("download", help="list and bring the public datasets"))
+    ahead = known.add_parser("compile", help="compile the kernels now, which the first run would wait for")
+    ahead.add_argument("--part", choices=tuple(PARTS), help="this part alone, in this process")
+    ahead.set_defaults(act=compile_kernels)
     doctor = known.add_parser("doctor", help="what this machine has, and what runs would choose")
     doctor.set_defaults(act=commands.doctor)
     for command in known.choices.values():

@@ -21,6 +21,11 @@ class ReprojectionFactor:
     weight: Array  # (p,) float64, 0 = no match
 
 
+def thinned_edge(edge: ReprojectionFactor, step: int) -> ReprojectionFactor:
+    """Every ``step``-th match, in arrays of their own: kernels are compiled for arrays without gaps."""
+    return ReprojectionFactor(edge.i, edge.j, edge.target[::step].copy(), edge.weight[::step].copy())
+
+
 @dataclass
 class KeyframeVariables:
     """One keyframe's unknowns in the problem, and their priors."""

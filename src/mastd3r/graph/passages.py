@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
-from .factors import KeyframeVariables, ReprojectionFactor
+from .factors import KeyframeVariables, thinned_edge
 from .initialisation import attempt, first_pairs
 from .intrinsics import as_given
 from .keyframe_graph import KeyframeGraph
@@ -155,8 +155,9 @@ def thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
         v = graph.variables[k]
         inv_depth = v.inv_depth[::step]
         info = np.full(len(inv_depth), DEPTH_PRIOR / float(np.median(v.inv_depth)) ** 2)
-        out.variables[k] = KeyframeVariables(v.px[::step], inv_depth.copy(), inv_depth.copy(), info, v.cam_from_world)
-    out.edges = [ReprojectionFactor(e.i, e.j, e.target[::step], e.weight[::step]) for e in graph.edges_among(ids)]
+        px = v.px[::step].copy()  # kernels are compiled for arrays without gaps
+        out.variables[k] = KeyframeVariables(px, inv_depth.copy(), inv_depth.copy(), info, v.cam_from_world)
+    out.edges = [thinned_edge(e, step) for e in graph.edges_among(ids)]
     return out
 
 

@@ -17,7 +17,7 @@ from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
 from ..types import USABLE_WEIGHT
 from .bundle_adjustment import solve
-from .factors import KeyframeVariables, ReprojectionFactor, Variables
+from .factors import KeyframeVariables, ReprojectionFactor, Variables, thinned_edge
 from .intrinsics import HELD_AT_FIRST, Intrinsics
 from .keyframe_graph import KeyframeGraph
 from .observability import MODEL_ERROR_RATIO, Observability, PairMotion, observability
@@ -82,15 +82,13 @@ def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> tuple[Variables, list[
     step = max(1, round(count / MOST_POINTS))
     place = {k: n for n, k in enumerate(ids)}
     edges = [e for e in graph.edges_among(ids) if abs(place[e.i] - place[e.j]) <= APART]
-    return _at_infinity(graph, ids, step), [
-        ReprojectionFactor(e.i, e.j, e.target[::step], e.weight[::step]) for e in edges
-    ]
+    return _at_infinity(graph, ids, step), [thinned_edge(e, step) for e in edges]
 
 
 def _at_infinity(graph: KeyframeGraph, ids: Sequence[int], step: int) -> Variables:
     out = {}
     for k in ids:
-        px = graph.variables[k].px[::step]
+        px = graph.variables[k].px[::step].copy()  # kernels are compiled for arrays without gaps
         none = np.zeros(len(px))
         out[k] = KeyframeVariables(px, none, none.copy(), np.ones(len(px)), np.eye(4))
     return out
