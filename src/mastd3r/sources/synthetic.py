@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..camera.pinhole import Camera
+from ..concurrency import on_two_threads
 from ..errors import OutputError
 from ..types import Frame
 from .room import RayGrid, Room, camera_pose
@@ -40,40 +41,54 @@ def room_camera(width: int = 320, height: int = 240) -> Camera:
     return Camera.centred(FOCAL_RATIO * width, width, height)
 
 
-def synthetic_frames(frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Iterator[SyntheticView]:
-    """Frames of the room at 30 a second, one after another; the same seed gives the same pixels."""
-    room, camera = Room(seed), room_camera(width, height)
-    grid, fine = RayGrid(camera), RayGrid(camera.resized(2 * width, 2 * height))
-    for i in range(frames):
+class _Clip:
+    """Views of a room by number; each can be made alone, in any order."""
+
+    def __init__(self, width: int, height: int, seed: int) -> None:
+        self.room, self.seed = Room(seed), seed
+        camera = room_camera(width, height)
+        self.grid, self.fine = RayGrid(camera), RayGrid(camera.resized(2 * width, 2 * height))
+
+    def view(self, i: int) -> SyntheticView:
         time_s = i / CLIP_FPS
         pose = camera_pose(time_s)
-        centre = room.cast(grid, pose, time_s)
-        colour = room.shade(room.cast(fine, pose, time_s), fine, pose)
-        image = colour.reshape(height, 2, width, 2, 3).mean((1, 3))  # 2x2 rays a pixel
-        image += np.random.default_rng((seed, i)).normal(0, SENSOR_NOISE, image.shape)
-        yield SyntheticView(
+        camera = self.grid.camera
+        centre = self.room.cast(self.grid, pose, time_s)
+        colour = self.room.shade(self.room.cast(self.fine, pose, time_s), self.fine, pose)
+        image = colour.reshape(camera.height, 2, camera.width, 2, 3).mean((1, 3))  # 2x2 rays a pixel
+        image += np.random.default_rng((self.seed, i)).normal(0, SENSOR_NOISE, image.shape)
+        return SyntheticView(
             Frame(i, time_s, np.rint(image.clip(0, 255)).astype(np.uint8)),
-            centre.depth.reshape(height, width),
-            centre.ball.reshape(height, width),
+            centre.depth.reshape(camera.height, camera.width),
+            centre.ball.reshape(camera.height, camera.width),
             pose,
         )
 
 
+def synthetic_frames(frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Iterator[SyntheticView]:
+    """Frames of the room at 30 a second, one after another; the same seed gives the same pixels."""
+    return map(_Clip(width, height, seed).view, range(frames))
+
+
 def make_room_clip(folder: Path, frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Path:
     """Write the clip as a TUM-layout folder with depth, masks and poses. Raises OutputError."""
+    clip, kinds = _Clip(width, height, seed), ("rgb", "depth", "mask")
+
+    def write(i: int) -> tuple[str, str]:
+        """One view's files; its time stamp, and its line of groundtruth.txt."""
+        view = clip.view(i)
+        stamp = f"{view.frame.timestamp_s:.6f}"
+        for name, image in _files_of(view).items():
+            _write_png(folder / name / f"{stamp}.png", image)
+        return stamp, _pose_line(stamp, view.world_from_cam)
+
     try:
-        for name in ("rgb", "depth", "mask"):
+        for name in kinds:
             (folder / name).mkdir(parents=True, exist_ok=True)
-        lists: dict[str, list[str]] = {"rgb": [], "depth": [], "mask": []}
-        poses: list[str] = []
-        for view in synthetic_frames(frames, width, height, seed):
-            stamp = f"{view.frame.timestamp_s:.6f}"
-            for name, image in _files_of(view).items():
-                _write_png(folder / name / f"{stamp}.png", image)
-                lists[name].append(f"{stamp} {name}/{stamp}.png")
-            poses.append(_pose_line(stamp, view.world_from_cam))
-        for name, lines in lists.items():
-            _write_lines(folder / f"{name}.txt", "timestamp_s filename", lines)
+        written = on_two_threads(write, range(frames))
+        for name in kinds:
+            _write_lines(folder / f"{name}.txt", "timestamp_s filename", [f"{t} {name}/{t}.png" for t, _ in written])
+        poses = [line for _, line in written]
         _write_lines(folder / "groundtruth.txt", "timestamp_s tx ty tz qx qy qz qw (world_from_cam)", poses)
         (folder / "info.json").write_text(json.dumps(_info(frames, width, height, seed), indent=1))
     except OSError as e:
