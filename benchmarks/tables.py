@@ -3,8 +3,8 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a
-folder plots beside the page, the curve of the stress suite beside it.
+live.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's
+name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from dense_table import dense
 from live_table import live
 from map_tables import map_sections
 from masks_tables import masks
+from metric_table import metric_scale
 from networks_table import networks
 from speed_table import speed
 from splats_table import splats
@@ -88,6 +89,7 @@ def main() -> int:
     lines += dense(source.parent / "dense.json")
     lines += experiments(source.parent / "bench", target.parent / "plots")
     lines += map_sections(source.parent)
+    lines += metric_scale(source.parent / "metric_scale.json")
     lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]

@@ -47,7 +47,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
         "export",
         "networks",
     ),
-    ("parts", "experiments", "viewer"),
+    ("parts", "experiments", "viewer", "metric"),
     ("tracking",),
     ("offline",),
     ("slam",),

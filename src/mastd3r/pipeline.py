@@ -6,7 +6,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
 from .export.run_folder import RunFolder
 from .export.run_record import read_record
 from .export.trajectory_files import read_trajectory
+from .metric.spec import absolute
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
 from .offline.tracked import MapMaterial
@@ -70,6 +71,7 @@ def reconstruct(
     if stopped is not None:
         return _go_on(slam, stopped, reporter)
     inputs = [user_path(p) for p in (source, maps) if p is not None]
+    inputs += [] if slam.scale is None else slam.scale.inputs
     folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
     with folder:
         folder.update(source=read)
@@ -210,7 +212,7 @@ def _slam_of(path: str | Path, config: Config, maps: str | Path | None) -> tuple
         want_semantic=config.semantics in ("auto", "maps"),
         semantic_dir=None if maps is None else user_path(maps),
     )
-    config, notes = with_dataset_lens(config, source)
+    config, notes = with_dataset_lens(replace(config, scale=absolute(config.scale)), source)
     return Slam(config, source.size, source=source), notes
 
 
@@ -254,7 +256,7 @@ def _of_images(
         raise InputError("reconstruct: expected images, got none")
     height, width = np.shape(first[1])[:2] if np.ndim(first[1]) == 3 else (0, 0)
     slam = Slam(config, (width, height))
-    folder, temporary = _folder(wanted, [])
+    folder, temporary = _folder(wanted, [] if slam.scale is None else slam.scale.inputs)
     with folder, slam.job(folder, reporter) as job:
         with job.timed("tracking"), job.reporter.stage("tracking", None, "frames") as bar:
             for time_s, image in chain([first], rest):

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 from .camera.rectification import Rectifier, rectifier_for
 from .concurrency import Future, one_blas_thread, undivided
 from .config import Config, check_config
-from .errors import InputError
+from .errors import ConfigError, InputError
 from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.passages import retake_passages
+from .metric.measure import measure
 from .offline.checkpoints import Checkpoints, Memory
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
@@ -87,6 +88,11 @@ class Slam:
         Raises ConfigError and InputError for options that this machine or source cannot serve.
         """
         self.config = check_config(config or Config())
+        if live and self.config.scale:
+            raise ConfigError(
+                "live: expected no scale, as poses are given out before it is known; measure it afterwards"
+            )
+        self.scale = measure(self.config.scale)
         given = self.config.camera.intrinsics
         self.recorded = None if source is not None else _recorded(self.config, size)
         self.source: Source = source if source is not None else self.recorded  # type: ignore[assignment]
@@ -209,7 +215,7 @@ class Slam:
 
     def job(self, folder: RunFolder, reporter: Reporter | None = None, *, checkpoints: bool = False) -> RunJob:
         """What writes this run into a folder; with checkpoints, if the frames can be read again."""
-        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, self.map_device)
+        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, self.map_device, self.scale)
         if checkpoints and not can_remember(self.masks):
             folder.note("no checkpoints: the filter of the mask does not say what it remembers")
             checkpoints = False

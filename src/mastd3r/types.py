@@ -8,7 +8,7 @@ monocular lengths are map units and carry no suffix.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -159,6 +159,11 @@ class StaticCloud:
     spacing: Array  # (n,) float32, size in map units of the patch that a point stands for
     kf_id: Array  # (n,) int32
 
+    def in_lengths(self, factor: float) -> StaticCloud:
+        """The same with lengths times ``factor``."""
+        points, spacing = self.points_world * np.float32(factor), self.spacing * np.float32(factor)
+        return replace(self, points_world=points, spacing=spacing)
+
 
 @dataclass(frozen=True)
 class Trajectory:
@@ -168,6 +173,12 @@ class Trajectory:
     world_from_cam: Array  # (n, 4, 4) float64
     states: tuple[State, ...]
     is_keyframe: Array  # (n,) bool
+
+    def in_lengths(self, factor: float) -> Trajectory:
+        """The same with lengths times ``factor``."""
+        poses = self.world_from_cam.copy()
+        poses[:, :3, 3] *= factor
+        return replace(self, world_from_cam=poses)
 
     def keyframes(self) -> Trajectory:
         """The rows that are keyframes."""

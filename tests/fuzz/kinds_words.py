@@ -4,13 +4,28 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 from pathlib import Path
 
 from fuzz.case import Case, Room, kind
 from fuzz.material import NAMES, NUMBERS, Shared, garbled, nasty, sparse
 from mastd3r.config import Config, config_to_yaml, ranges
 
-COMMANDS = ("run", "resume", "map", "demo", "eval", "export", "view", "bench", "weights", "download", "doctor", "live")
+COMMANDS = (
+    "run",
+    "resume",
+    "map",
+    "demo",
+    "eval",
+    "export",
+    "view",
+    "bench",
+    "weights",
+    "download",
+    "doctor",
+    "live",
+    "scale",
+)
 OPTIONS = ("--seed", "--start", "--end", "--stride", "--map-minutes", "--intrinsics", "--quality", "--kind", "--preset")
 YAML = (
     "!!int 'x'",
@@ -47,6 +62,32 @@ LAUGHS = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 def short_run(room: Room, shared: Shared, *words: str | Path) -> list[str | Path]:
     """A run that ends by itself at once, if it is not refused before: one image is too little."""
     return ["run", shared.one_image, "--out", room.out, "--no-map", "--quiet", *words]
+
+
+@kind("metric scale", 40)
+def metric_scale(rng: random.Random, room: Room, shared: Shared) -> Case:
+    """What metres are taken from: words, files of positions, folders of depth; for a run, and on one that has ended."""
+    number, file = rng.choice(NUMBERS), room.path / "positions.csv"
+    head = rng.choice(("", "time,x,y,z\n", "t,lat,lon,alt\n", "#timestamp [ns],,\n", "time\n", '"time","x","y","z"\n'))
+    rows = [",".join(rng.choice((number, "1", "0.5", str(n))) for _ in range(rng.choice((2, 4, 8)))) for n in range(9)]
+    text = (head + "\n".join(rows)).encode()
+    file.write_bytes(garbled(rng, text) if rng.random() < 0.5 else text)
+    words = rng.choice(
+        (
+            f"positions:{file}",
+            f"positions:{file}",
+            f"positions:{rng.choice(NAMES)}",
+            f"depth:{shared.run.parent / 'photos'}={number}",
+            f"depth:{shared.run / rng.choice(('masks', 'renders', '.'))}={rng.choice((number, '255'))}",
+            f"camera-height={number}",
+            f"factor={number}",
+            f"points:{rng.choice((number, '0', 'x.png', ''))}:{number},1:2,2={rng.choice((number, '1'))}",
+            rng.choice(YAML),
+        )
+    )
+    if rng.random() < 0.5:
+        return Case(["scale", shutil.copytree(shared.run, room.path / "run"), words])
+    return Case(short_run(room, shared, f"--scale={words}"))
 
 
 @kind("option values", 90)

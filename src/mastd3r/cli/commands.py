@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ..config import Config, config_to_yaml, ranges
-from ..errors import ConfigError
+from ..errors import ConfigError, InputError
 from .options import checked_minutes, config_from_args
 from .screen import screen
 from .signals import end_this_command
@@ -35,6 +35,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
     return _run_and_show(args.source, config, args, console)
+
+
+def scale(args: argparse.Namespace, console: Console) -> int:
+    """``mastd3r scale``."""
+    from ..pipeline import load
+
+    facts = load(args.run).measure_scale(args.by)
+    screen().print(f"{facts['said']}; exports of {args.run} are in metres now", soft_wrap=True, markup=False)
+    return 0
 
 
 def resume(args: argparse.Namespace, console: Console) -> int:
@@ -95,7 +104,14 @@ def show(result: Reconstruction) -> None:
     if result.observability.get("said"):
         screen().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
     screen().print(_table(result.metrics))
+    if result.scale.get("said"):
+        screen().print(f"{result.scale['said']}; all lengths are metres", soft_wrap=True, markup=False)
     _open(result.path)
+    if result.scale.get("refused"):
+        raise InputError(
+            f"{result.scale['refused']}; the run is complete, its lengths are map units: mastd3r scale {result.path} "
+            "tries another way"
+        )
 
 
 def _open(run: Path) -> None:
@@ -158,8 +174,10 @@ def export(args: argparse.Namespace, console: Console) -> int:
 
     reporter = reporter_of(args, console)
     options = {"source": args.source, "undistort": args.undistort, "all_poses": args.all_poses}
-    written = load(args.run).export(args.to, args.out, reporter=reporter, **options)
-    screen().print(f"wrote {written}", soft_wrap=True, markup=False)
+    run = load(args.run)
+    written = run.export(args.to, args.out, reporter=reporter, **options)
+    unit = ", in metres" if "metres_per_unit" in run.scale else ""
+    screen().print(f"wrote {written}{unit}", soft_wrap=True, markup=False)
     return 0
 
 

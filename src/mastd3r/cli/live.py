@@ -24,7 +24,8 @@ CAMERA_HELP = (
     "0 (a camera of this machine) or its device; a URL (rtsp, http, udp, ...); - for raw frames or y4m on standard "
     "input; a ROS bag or MCAP file; a video, folder or dataset, played at its own pace"
 )
-NOT_LIVE = ("pointmaps", "semantics", "maps", "cloud", "seed", "map_loss", "map_minutes")  # by --set, or not at all
+# by --set, or not at all
+NOT_LIVE = ("pointmaps", "semantics", "maps", "cloud", "scale", "seed", "map_loss", "map_minutes")
 PIXEL_FORMATS = ("bgr24", "rgb24", "gray8")
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ..config import Config, check_config, config_from_yaml, preset, with_override
 from ..errors import ConfigError
+from ..metric.spec import parsed
 from ..reading.files import short, user_path
 
 
@@ -45,6 +46,8 @@ def config_from_args(args: argparse.Namespace) -> Config:
         config = replace(config, mapping=replace(config.mapping, minutes=minutes))
     if args.no_map:
         config = replace(config, mapping=replace(config.mapping, enabled=False))
+    if args.scale is not None:
+        config = replace(config, scale=parsed(args.scale).text)
     if args.maps is not None and config.semantics == "auto":
         config = replace(config, semantics="maps")
     if args.intrinsics == "dataset":

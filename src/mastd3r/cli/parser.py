@@ -12,6 +12,7 @@ from .. import __version__
 from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
 from ..errors import ConfigError
 from ..export.kinds import KINDS
+from ..metric.spec import FORMS
 from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
@@ -33,6 +34,8 @@ OVERWRITE_HELP = "remove an earlier run in --out at once (default: it is replace
 MINUTES_HELP = "train the map for so long, instead of for the number of steps of its quality (the default)"
 
 
+FORMS_SHOWN = ", ".join(FORMS.values())
+SCALE_HELP = f"everything in metres, taken from {FORMS_SHOWN} (default: map units)"
 CLOUD_HELP = f"dense: depth of every keyframe pixel too, as cloud_dense.ply (default {Config().cloud})"
 
 
@@ -85,6 +88,10 @@ def parser() -> argparse.ArgumentParser:
     demo.set_defaults(act=commands.demo)
     _eval_parser(known.add_parser("eval", help="score a run, or another system's trajectory, against truth"))
     _export_parser(known.add_parser("export", help="write a run for other tools"))
+    measured = known.add_parser("scale", help="measure metres on a run that has ended: its exports are in metres then")
+    measured.add_argument("run", type=path, help="run folder")
+    measured.add_argument("by", metavar="BY", help=f"what metres are taken from: {FORMS_SHOWN}")
+    measured.set_defaults(act=commands.scale)
     view_parser(known.add_parser("view", help="show a run in the browser"))
     bench_parser(known.add_parser("bench", help="run a suite of experiments and make its tables"))
     weights_parser(known.add_parser("weights", help="list, download and check the weights of the networks"))
@@ -150,6 +157,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--cloud", choices=get_args(CloudKind), help=CLOUD_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--no-loops", action="store_true", help="places that are seen again do not close the trajectory")
+    p.add_argument("--scale", metavar="BY", help=SCALE_HELP)
     p.add_argument("--intrinsics", metavar="FX,FY,CX,CY[,K1[,K2,P1,P2[,K3[,K4,K5,K6]]]]|dataset", help=INTRINSICS_HELP)
     p.add_argument("--kind", choices=get_args(SourceKind), help="layout of the source (default: found by looking)")
     p.add_argument("--realtime", action="store_true", help="start the map while tracking, in a process of its own")

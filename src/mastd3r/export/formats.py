@@ -22,11 +22,11 @@ from .trajectory_files import write_tum
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 BAG = "trajectory"  # folder of the bag
-EUROC_HEADER = "#timestamp [ns],p_x,p_y,p_z [map units],q_w,q_x,q_y,q_z (world_from_cam)\n"
+EUROC_HEADER = "#timestamp [ns],p_x,p_y,p_z [{unit}],q_w,q_x,q_y,q_z (world_from_cam)\n"
 
 
 def export_trajectory(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> Path:
-    """Write a run's poses (world_from_cam, OpenCV axes, map units) to ``out``, a file, for ros a folder; gives it.
+    """Write a run's poses (world_from_cam, OpenCV axes, ``run.unit``) to ``out``, a file, for ros a folder; gives it.
 
     tum: timestamp, position, quaternion xyzw. euroc: nanoseconds, position, quaternion wxyz, with commas. ros: a bag,
     see ``write_ros``. These have the poses that were measured, and with ``all_poses`` the interpolated ones. kitti:
@@ -41,7 +41,7 @@ def export_trajectory(run: Run, kind: str, out: Path, *, all_poses: bool = False
         _refuse_gaps(run)
     if kind == "ros":
         check_package()
-        with export_folder(out, {"kind": kind, "run": str(run.path.resolve())}, []) as staged:
+        with export_folder(out, {"kind": kind, "run": str(run.path.resolve()), "unit": run.unit}, []) as staged:
             write_ros(staged / BAG, trajectory)
         return out
     with writing(out):
@@ -49,7 +49,7 @@ def export_trajectory(run: Run, kind: str, out: Path, *, all_poses: bool = False
     if kind == "tum":
         write_tum(out, trajectory)
     else:
-        write_text(out, kitti_text(trajectory) if kind == "kitti" else euroc_text(trajectory))
+        write_text(out, kitti_text(trajectory) if kind == "kitti" else euroc_text(trajectory, run.unit))
     return out
 
 
@@ -82,10 +82,10 @@ def kitti_text(trajectory: Trajectory) -> str:
     return "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows)
 
 
-def euroc_text(trajectory: Trajectory) -> str:
+def euroc_text(trajectory: Trajectory, unit: str) -> str:
     """One row a pose: nanoseconds, position, quaternion wxyz."""
     poses = trajectory.world_from_cam
-    lines = [EUROC_HEADER]
+    lines = [EUROC_HEADER.format(unit=unit)]
     for time_s, p, q in zip(
         trajectory.timestamps_s, poses[:, :3, 3], quaternion_from_rotation(poses[:, :3, :3]), strict=True
     ):

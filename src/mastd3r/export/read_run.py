@@ -16,10 +16,12 @@ from ..errors import InputError
 from ..reading.files import whole_bytes, whole_json, whole_text
 from ..reading.pictures import decoded
 from ..reading.yaml_text import MOST_YAML_BYTES
-from ..types import State, Trajectory
+from ..types import State, StaticCloud, Trajectory
 from .claim import PICTURE
+from .point_cloud import read_cloud
 from .run_folder import stamp
 from .run_record import checked_camera, checked_metrics, read_record
+from .tracks import Tracks, read_tracks
 from .trajectory_files import read_tum
 
 Array = NDArray[Any]
@@ -37,6 +39,34 @@ class Run:
     config: str
     camera: Camera | None
     distortion: tuple[float, ...] = ()  # of the camera, OpenCV's order k1 k2 p1 p2 [k3 [k4 k5 k6]]
+    lengths: float = 1.0  # what lengths of the folder's files are to be multiplied with, for ``trajectory``'s unit
+
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Metres a unit of the folder's files, as run.json says; None where nobody has measured it."""
+        facts = self.record.get("scale") or {}
+        return 1.0 if facts.get("applied") else facts.get("metres_per_unit")
+
+    @property
+    def unit(self) -> str:
+        """Of ``trajectory``, and of what ``cloud`` and ``tracks`` give: m, or map units."""
+        known = self.metres_per_unit
+        return "m" if known is not None and known == self.lengths else "map units"
+
+    def in_metres(self) -> Run:
+        """The same in metres where run.json knows them, as it is where it does not; the folder is not changed."""
+        factor = self.metres_per_unit
+        if factor is None or factor == self.lengths:
+            return self
+        return replace(self, trajectory=self.trajectory.in_lengths(factor / self.lengths), lengths=factor)
+
+    def cloud(self) -> StaticCloud:
+        """cloud.ply. Raises InputError."""
+        return read_cloud(self.path / "cloud.ply").in_lengths(self.lengths)
+
+    def tracks(self) -> Tracks:
+        """tracks.npz. Raises InputError."""
+        return read_tracks(self.path / "tracks.npz").in_lengths(self.lengths)
 
     def mask_times_s(self) -> Array:
         """(n,) times of the frames that have a mask."""

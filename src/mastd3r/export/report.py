@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
+from ..reading.files import is_file, whole_text
 from ..types import Trajectory
 from .evidence import FULL_SCALE_LOG, EvidenceSample, panel
 from .files import write_text
@@ -25,6 +27,7 @@ from .report_files import RunFile, size_shown
 
 Array = NDArray[Any]
 OVERLAY_WIDTH_PX = 480
+SCALE = re.compile(r'<p class="scale">[^<]*</p>')
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,7 @@ class ReportData:
     trajectory: Trajectory
     positions: Array  # (n, 3) float64
     truth: Array | None  # (n, 3) float64, NaN where a frame has none; None without truth
-    unit: str  # "m" where truth gives the scale, otherwise "map units"
+    unit: str  # "m" where truth or run.json gives the scale, otherwise "map units"
     renders: tuple[RenderSample, ...]
     masks: tuple[MaskSample, ...]
     metrics: Mapping[str, Any]
@@ -89,9 +92,33 @@ def report_html(data: ReportData) -> str:
     return template.substitute(
         title=escape(data.title),
         summary=escape(summary_line(data.metrics)),
+        scale=_scale(data.record),
         banner=_banner(data.record),
         sections="\n".join(s for s in sections if s),
     )
+
+
+def say_scale(run_dir: Path, record: Mapping[str, Any]) -> None:
+    """Put what ``record`` says of metres into the report that is there; the rest of it stays. Raises OutputError."""
+    path = run_dir / "report.html"
+    if not is_file(path):
+        return
+    text = whole_text(path, "a readable report")
+    if SCALE.search(text) is not None:
+        write_text(path, SCALE.sub(lambda _: _scale(record), text, count=1))
+
+
+def _scale(record: Mapping[str, Any]) -> str:
+    """The paragraph of ``SCALE``: empty where nobody asked for metres."""
+    facts = record.get("scale") or {}
+    said = facts.get("said")
+    if said:
+        here = "in the metres of before" if facts.get("before") else "in map units"
+        where = "all lengths are metres" if facts.get("applied") else f"exports are in metres, this folder {here}"
+        said = f"{said} (--scale {facts.get('asked')}): {where}."
+    elif facts.get("refused"):
+        said = f"Lengths are map units: {facts['refused']}"
+    return f'<p class="scale">{escape(said or "")}</p>'
 
 
 def _banner(record: Mapping[str, Any]) -> str:
@@ -209,7 +236,7 @@ def _trajectory(data: ReportData) -> str:
     if data.truth is not None:
         text += "Scaled and turned to fit truth (Sim(3), all frames); the view from above is coloured by error."
     else:
-        text += "A single camera cannot tell the scale: lengths are map units."
+        text += "A single camera cannot tell the scale: lengths are map units." if data.unit != "m" else ""
     legend = _legend(data, error is not None)
     plots = "".join(plot(*shared, width=width) for plot in (top_view, over_time) for width in (WIDTH, NARROW))
     return _section("Trajectory", text, plots + legend)

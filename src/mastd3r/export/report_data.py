@@ -29,7 +29,7 @@ def gather_report_data(
     title: str = "",
     evidence: EvidenceSample | None = None,
 ) -> ReportData:
-    """Choose the pictures and put the path into metres where truth gives the scale.
+    """Choose the pictures and put the path into metres where truth, or else run.json, gives the scale.
 
     ``psnr_db`` holds timestamp_s -> PSNR of each holdout frame: the best, median and worst are shown.
     ``truth_in_map`` (n, 3) are the true positions in the map's frame and units, one a row of the trajectory,
@@ -50,13 +50,14 @@ def gather_report_data(
             decibels = next(v for t, v in psnr_db.items() if stamp(t) == name)
             renders[name] = RenderSample(labels[name], frame.timestamp_s, photograph, splat, decibels)
     has_truth = truth_in_map is not None and metres_per_unit is not None
-    scale = metres_per_unit if has_truth and metres_per_unit is not None else 1.0
+    known = metres_per_unit if has_truth else run.metres_per_unit
+    scale = 1.0 if known is None else known
     return ReportData(
         title=title or run.path.resolve().name,
         trajectory=run.trajectory,
         positions=run.trajectory.world_from_cam[:, :3, 3] * scale,
         truth=truth_in_map * scale if has_truth and truth_in_map is not None else None,
-        unit="m" if has_truth else "map units",
+        unit="map units" if known is None else "m",
         renders=tuple(renders[name] for name in labels if name in renders),
         masks=tuple(masks),
         metrics=run.metrics,

@@ -15,6 +15,7 @@ from ..types import State
 
 NOT_OF_THE_LENS = ("found", "focal_sigma_ratio")  # of camera.json
 MOST_FOCAL_RATIO = 1e4  # of the image's longer side
+MOST_SCALE = 1e9  # metres a map unit, and map units a metre
 MOST_TERMS = 8  # of OpenCV's lens
 Fits = Callable[[Any], bool]
 
@@ -27,6 +28,11 @@ def number(value: Any) -> bool:
 def above_0(value: Any) -> bool:
     """A finite number above 0."""
     return number(value) and value > 0
+
+
+def not_negative(value: Any) -> bool:
+    """A finite number, 0 or more."""
+    return number(value) and value >= 0
 
 
 def text(value: Any) -> bool:
@@ -71,9 +77,17 @@ RECORD: dict[str, tuple[Fits, str]] = {
     "observability": (mapping(), "an object"),
     "observability.said": (text, "text"),
     "camera": (mapping(), "an object"),
-    "camera.focal_sigma_ratio": (lambda v: v is None or number(v), "a number"),
+    "camera.focal_sigma_ratio": (lambda v: v is None or not_negative(v), "a number, 0 or more"),
     "camera.found": (text, "text"),
     "world": (mapping(), "an object"),
+    "world.down_sigma_deg": (not_negative, "degrees"),
+    "scale": (mapping(), "an object"),
+    "scale.asked": (text, "text"),
+    "scale.metres_per_unit": (lambda v: number(v) and 1 / MOST_SCALE < v < MOST_SCALE, "metres of a map unit"),
+    "scale.sigma_ratio": (lambda v: v is None or not_negative(v), "a number, 0 or more"),
+    "scale.applied": (lambda v: isinstance(v, bool), "true or false"),
+    "scale.said": (text, "text"),
+    "scale.refused": (text, "text"),
     "graph": (mapping(), "an object"),
     "live": (mapping(), "an object"),
     "live.recorded": (lambda v: isinstance(v, bool), "true or false"),

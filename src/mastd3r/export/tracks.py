@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,10 @@ class Tracks:
     point: Array  # (m,) int32 row of points_world
     frame: Array  # (m,) int32 row of timestamps_s
     px: Array  # (m, 2) float32 where the frame was measured to see the point; pixels of the full-size photograph
+
+    def in_lengths(self, factor: float) -> Tracks:
+        """The same with lengths times ``factor``."""
+        return replace(self, points_world=self.points_world * np.float32(factor))
 
     def seen(self, keep: Array) -> Tracks:
         """The observations in ``keep`` (m,) bool, and the points that at least two frames still see."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[Any]
@@ -21,3 +22,8 @@ class GaussianArrays:
     colors: Array  # (n, 3) float32 RGB, 0..1
     kf_id: Array  # (n,) int32
     sh_rest: Array  # (n, K - 1, 3) float32, spherical harmonics above the constant one; K = 1, 4, 9 or 16
+
+    def in_lengths(self, factor: float) -> GaussianArrays:
+        """The same with lengths times ``factor``; what is seen from cameras that are moved alike stays as it is."""
+        means, scales = self.means * np.float32(factor), self.scales * np.float32(factor)
+        return replace(self, means=means, scales=scales)

@@ -12,7 +12,7 @@ import os
 import queue
 import signal
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from ..config import MappingConfig
@@ -53,6 +53,10 @@ class Outcome:
     gaussians: GaussianArrays | None
     steps: int
     views: int
+
+    def in_lengths(self, factor: float) -> Outcome:
+        """The same with lengths times ``factor``."""
+        return self if self.gaussians is None else replace(self, gaussians=self.gaussians.in_lengths(factor))
 
 
 class Trainer:

@@ -30,6 +30,7 @@ class JobMemory:
     tracking_s: float
     final: list[FinalFrame]
     turns_only: bool
+    scale: dict[str, Any] | None = None  # what run.json says of the unit that ``final`` has
 
 
 @dataclass(frozen=True)

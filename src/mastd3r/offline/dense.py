@@ -16,7 +16,6 @@ from ..errors import ConfigError, InputError
 from ..export.dense_files import write_dense_cloud
 from ..export.files import writing
 from ..export.mesh_files import write_mesh
-from ..export.point_cloud import read_cloud
 from ..export.read_run import Run
 from ..export.run_folder import stamp
 from ..mvs.depth_maps import DepthMaps, dense_depth
@@ -80,7 +79,7 @@ def with_frames_between(tracked: Trajectory) -> Trajectory:
 def densified(run: Run, source: Source, reporter: Reporter) -> Dense:
     """Depth maps of the keyframes. Raises InputError as ``stereo_views``, and for a run without a cloud."""
     began = time.perf_counter()
-    points = read_cloud(run.path / "cloud.ply").points_world
+    points = run.cloud().points_world
     views = stereo_views(run, source)
     if len(views) < 2:
         raise InputError(f"{run.path}: expected at least 2 keyframes with a pose to compare, got {len(views)}")
@@ -131,6 +130,6 @@ def export_dense(run: Run, source: Source, kind: str, out: Path, reporter: Repor
     mesh = meshed(dense.views, dense.maps)
     if not len(mesh.faces):
         raise InputError(f"{run.path}: expected surfaces that several keyframes see alike, got none to make a mesh of")
-    log.info("mesh: %d triangles, voxels of %.3g map units", len(mesh.faces), mesh.voxel)
+    log.info("mesh: %d triangles, voxels of %.3g %s", len(mesh.faces), mesh.voxel, run.unit)
     write_mesh(out, mesh.vertices_world, mesh.faces, mesh.colors)
     return out

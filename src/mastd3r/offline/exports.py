@@ -17,10 +17,10 @@ from ..export.files import write_json
 from ..export.formats import evenly, exported_poses
 from ..export.lens_models import colmap_model
 from ..export.nerfstudio import transforms
-from ..export.point_cloud import read_cloud, write_cloud
+from ..export.point_cloud import write_cloud
 from ..export.read_run import Run
 from ..export.run_folder import stamp
-from ..export.tracks import Tracks, read_tracks
+from ..export.tracks import Tracks
 from ..geometry.se3 import inverse
 from ..types import Source, Trajectory
 from .exported_view import KEEP, ExportedView
@@ -61,7 +61,7 @@ def export_pictures(
     trajectory = exported_poses(run, all_poses)
     view = ExportedView(lens_of(run), undistort)
     write = {"colmap": _write_colmap, "nerfstudio": _write_nerfstudio}[kind]
-    facts = {"kind": kind, "run": str(run.path.resolve()), "undistorted": view.undistorts}
+    facts = {"kind": kind, "run": str(run.path.resolve()), "unit": run.unit, "undistorted": view.undistorts}
     with export_folder(out, facts, [source_path]) as staged:
         write(staged, run, _write_images(staged, run, trajectory, source, view), view)
     if view.undistorts and undistort is None:
@@ -107,7 +107,7 @@ def _write_colmap(staged: Path, run: Run, written: Written, view: ExportedView) 
 def _write_nerfstudio(staged: Path, run: Run, written: Written, view: ExportedView) -> None:
     poses = written.trajectory.world_from_cam
     write_json(staged / "transforms.json", transforms(view.lens, written.names, poses, CLOUD))
-    write_cloud(staged / CLOUD, read_cloud(run.path / CLOUD))
+    write_cloud(staged / CLOUD, run.cloud())
 
 
 def colmap_of(run: Run, written: Written, view: ExportedView) -> ColmapModel:
@@ -119,13 +119,13 @@ def colmap_of(run: Run, written: Written, view: ExportedView) -> ColmapModel:
         log.warning(
             "%s has no tracks.npz (an older run): points are those of the cloud, without observations", run.path
         )
-        cloud = read_cloud(run.path / "cloud.ply")
+        cloud = run.cloud()
         chosen = evenly(len(cloud.points_world), MAX_POINTS)
         nothing = np.zeros(0, int)
         errors = np.full(len(chosen), NO_ERROR_KNOWN)
         points = cloud.points_world[chosen], cloud.colors[chosen]
         return ColmapModel(*common, *points, errors, nothing, nothing, np.zeros((0, 2)))
-    tracks, image, px = _observed(read_tracks(run.path / "tracks.npz"), written.trajectory, view)
+    tracks, image, px = _observed(run.tracks(), written.trajectory, view)
     points_world = tracks.points_world.astype(float)
     error = _errors_px(points_world[tracks.point], cam_from_world, image, px, view)
     count = np.bincount(tracks.point, minlength=len(points_world))

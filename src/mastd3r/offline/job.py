@@ -42,6 +42,7 @@ from .dense import write_dense_cloud_of
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from .live_map import LiveMap
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
+from .metres import in_lengths, scale_notes, scale_of_run
 from .placement import place_frames
 from .run_report import write_run_report
 from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
@@ -70,6 +71,7 @@ class RunJob:
         self._began = time.perf_counter()
         self._final: list[FinalFrame] = []
         self._turns_only = False  # the camera has one place: there is no depth
+        self._scale: dict[str, Any] | None = None  # run.json's: what metres were taken from
         self._evidence: EvidenceSample | None = None  # of the frame that shows most
         realtime = self.config.mapping.enabled and self.config.mapping.realtime
         self._live = LiveMap(self.config, tracked.map_device) if realtime else None
@@ -95,12 +97,14 @@ class RunJob:
             return
         spent = time.perf_counter() - self._began
         tracked_s = self.timings.get("tracking", 0.0) if stage != "tracking" else spent
-        self.checkpoints.write(stage, tracking, JobMemory(self.frames, tracked_s, self._final, self._turns_only))
+        self.checkpoints.write(
+            stage, tracking, JobMemory(self.frames, tracked_s, self._final, self._turns_only, self._scale)
+        )
 
     def go_on(self, memory: JobMemory) -> None:
         """From what an earlier process has written down; a map that was begun while tracking is not among it."""
         self.already_tracked(memory.frames, memory.tracking_s)
-        self._final, self._turns_only = memory.final, memory.turns_only
+        self._final, self._turns_only, self._scale = memory.final, memory.turns_only, memory.scale
         if self._live is not None:
             self._live.close()
             self._live = None
@@ -140,15 +144,14 @@ class RunJob:
                 )
             assumed, found = provider.depth_sigma_ratio, own_depth_spread(graph)
             if assumed is not None and found is not None:
-                spread = f"own depths differ from the solved ones by {found:.1%} (1 sigma), assumed {assumed:.1%}"
-                self.folder.note(spread)
+                self.folder.note(f"own depths differ from the solved by {found:.1%} (1 sigma), assumed {assumed:.1%}")
             self._turn_upright()
-            self._final = final_frames(graph)
-            self._write_trajectory()
+            final = final_frames(graph)
             if self._live is not None:
                 self._begun, facts, note = self._live.finish(graph, self.tracked.lens)
                 self.folder.update(realtime=facts)
                 self.folder.note(note)
+            self._set_unit(final)
 
     def smooth_masks(self, appearance: Any) -> MapMaterial:
         """Masks under the final poses, every frame placed once more under them, and the static cloud."""
@@ -317,6 +320,17 @@ class RunJob:
             finally:
                 video.close()
 
+    def _set_unit(self, final: list[FinalFrame]) -> None:
+        """Everything from here on in metres, where that was asked for and can be measured; the poses are written."""
+        facts = scale_of_run(self.tracked, final, self.folder.record)
+        self.folder.note(*scale_notes(facts))
+        with undivided():  # the graph, the poses and what is said of their unit belong together
+            if facts is not None and facts["applied"]:
+                final = in_lengths(self.graph, final, facts["metres_per_unit"])
+                self._begun = None if self._begun is None else self._begun.in_lengths(facts["metres_per_unit"])
+            self._final, self._scale = final, facts
+            self._write_trajectory()
+
     def _write_trajectory(self) -> None:
         graph = self.graph
         self.folder.write_trajectory(trajectory_of(self._final))
@@ -336,6 +350,7 @@ class RunJob:
             facts["distortion"] = list(lens.distortion)
         self.folder.update(
             camera=facts,
+            scale=self._scale,
             graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
             files=names_by_time(self.source, [(f.record.index, f.record.timestamp_s) for f in self._final]),
         )
@@ -369,8 +384,8 @@ class RunJob:
             if not self._final and started:  # before that there is neither place nor lens
                 if graph.initialised:
                     graph.solve_all(5, 1.0)
-                self._final = final_frames(graph)
-                self._write_trajectory()
+                self.folder.record.pop("world", None)  # it is not turned upright
+                self._set_unit(final_frames(graph))
             self.folder.note(*self.source.notes)
             self.folder.update(timings_s=self.timings)
         except Exception as e:  # noqa: BLE001  whatever state the first error left

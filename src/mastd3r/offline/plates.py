@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from ..camera.map_view import MapView
 from ..export.read_run import Run
-from ..mapping.ply import read_gaussians_ply
 from ..mapping.splat import NEAR_RATIO, Splat
 from .exported_view import MOVES_LEVEL, over_photograph
-from .renders import lens_of, map_facts
+from .renders import gaussians_of, lens_of, median_depth_of
 
 Array = NDArray[Any]
 MARGIN_RATIO = 0.01  # of the image's width: what moves is replaced with so much around it
@@ -25,8 +24,7 @@ class Plates:
 
     def __init__(self, run: Run) -> None:
         """Raises InputError for a run without a map."""
-        gaussians = read_gaussians_ply(run.path / "gaussians.ply")
-        self._splat = Splat(gaussians, NEAR_RATIO * map_facts(run)["median_depth"])
+        self._splat = Splat(gaussians_of(run), NEAR_RATIO * median_depth_of(run))
         lens = lens_of(run)
         self._view = MapView(lens, lens.width, 1.0)
 

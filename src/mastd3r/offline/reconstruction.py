@@ -20,15 +20,18 @@ from ..config import Config, MapQualityKind, config_from_text
 from ..errors import ConfigError, InputError
 from ..evaluation.cloud_error import evaluate_cloud
 from ..evaluation.evaluate import evaluate
-from ..export.claim import claim, settle
+from ..export.claim import check_not_in_use, claim, settle
 from ..export.files import write_json, writing
 from ..export.formats import export_trajectory
 from ..export.kinds import DENSE, KINDS, PICTURES, SPLATS, TRAJECTORIES, UNDISTORTING
 from ..export.point_cloud import read_cloud, read_points
 from ..export.read_run import Run, read_run
+from ..export.report import say_scale
 from ..export.run_folder import RunFolder
 from ..mapping.gaussians import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
+from ..metric.measure import measure
+from ..metric.spec import FORMS, absolute
 from ..progress import Reporter, Silent
 from ..reading.files import is_file, user_path
 from ..sources import open_source
@@ -36,6 +39,7 @@ from ..types import StaticCloud
 from .continued_map import continue_map
 from .dense import CLOUD_FILE, export_dense
 from .exports import export_pictures, export_plates
+from .metres import material_of_run, scale_facts
 from .renders import export_splat, lens_of
 from .run_report import write_run_report
 
@@ -70,7 +74,7 @@ class Masks(Sequence[Array]):
 
 
 class Reconstruction:
-    """Trajectory, lens, masks, static cloud and splat of one video. Lengths are map units, axes OpenCV's."""
+    """Trajectory, lens, masks, static cloud and splat of one video. Map units, or metres: see ``scale``."""
 
     def __init__(self, path: Path, temporary: tempfile.TemporaryDirectory[str] | None = None) -> None:
         """``path``: a run folder. ``temporary`` is kept as long as this is. Raises InputError where it is none."""
@@ -142,6 +146,37 @@ class Reconstruction:
         ``said`` is the line for people where something is missing, else None; empty for a run that was stopped before.
         """
         return dict(self._run.record.get("observability") or {})
+
+    @property
+    def scale(self) -> dict[str, Any]:
+        """What run.json says of metres: ``metres_per_unit``, ``sigma_ratio`` (1 sigma), where from; empty without.
+
+        ``applied``: all lengths of the run folder are metres; otherwise they are map units, and exports are in metres.
+        ``refused`` says why what was asked for could not be measured.
+        """
+        return dict(self._run.record.get("scale") or {})
+
+    def measure_scale(self, by: str) -> dict[str, Any]:
+        """Metres a unit of this map, as ``mastd3r scale``; run.json has them from here on, and exports are in metres.
+
+        by: the words of ``--scale``. Raises ConfigError for others, InputError where it cannot be measured, and the
+        run stays as it is; OutputError.
+        """
+        wanted = measure(absolute(by))
+        if wanted is None:
+            raise ConfigError(f"scale: expected {', '.join(FORMS.values())}, got nothing")
+        check_not_in_use(self.path)
+        before = self.scale
+        facts = scale_facts(wanted, lambda: material_of_run(self._run), self._run.record)
+        if "refused" in facts:
+            raise InputError(facts["refused"])
+        if applied := before if before.get("applied") else before.get("before"):
+            facts["before"] = applied  # the unit that is measured is the metre of that
+        folder = RunFolder.again(self.path, self._run.record)
+        folder.update(scale=facts)
+        say_scale(self.path, folder.record)
+        self._run = read_run(self.path)
+        return facts
 
     @property
     def is_complete(self) -> bool:
@@ -252,22 +287,23 @@ class Reconstruction:
 
         source: where the photographs are, if no longer where the run read them. undistort: whether images become those
         of a pinhole; None: where the lens is bent. all_poses: interpolated poses too, not only measured ones.
+        Lengths are metres where the run knows them (``scale``), else map units.
         Raises ConfigError for a format or an option that is not known, InputError for one that the run has nothing for,
         and OutputError.
         """
-        out = user_path(out, "out")
+        out, run = user_path(out, "out"), self._run.in_metres()
         _check_export(kind, source, undistort, all_poses)
         if kind in SPLATS:
-            return export_splat(self._run, kind, out, all_poses=all_poses)
+            return export_splat(run, kind, out, all_poses=all_poses)
         if kind in TRAJECTORIES:
-            return export_trajectory(self._run, kind, out, all_poses=all_poses)
+            return export_trajectory(run, kind, out, all_poses=all_poses)
         path = self._photographs(source)
         opened = open_source(path, self.config.source, want_semantic=False)
         if kind in DENSE:
-            return export_dense(self._run, opened, kind, out, reporter or Silent())
+            return export_dense(run, opened, kind, out, reporter or Silent())
         if kind == "plates":
-            return export_plates(self._run, out, opened, path, all_poses=all_poses)
-        return export_pictures(self._run, kind, out, opened, path, undistort=undistort, all_poses=all_poses)
+            return export_plates(run, out, opened, path, all_poses=all_poses)
+        return export_pictures(run, kind, out, opened, path, undistort=undistort, all_poses=all_poses)
 
 
 def _check_export(kind: str, source: str | Path | None, undistort: bool | None, all_poses: bool) -> None:

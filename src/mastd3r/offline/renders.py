@@ -21,6 +21,7 @@ from ..export.read_run import Run
 from ..export.run_folder import write_depth_png
 from ..export.video import write_video
 from ..geometry.path import smoothed_path
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
 from ..mapping.splat import NEAR_RATIO, Splat
 from ..mapping.spz import write_gaussians_spz
@@ -76,17 +77,17 @@ def export_splat(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> 
     """``mastd3r export --to spz|flight|depth``: the splat of a run; gives the path written.
 
     spz: a file. flight: an .mp4. depth: a folder of 16-bit images <timestamp>.png of every pose that was measured, and
-    with ``all_poses`` of the interpolated ones; its export.json says ``depth_png_per_unit``, steps a map unit.
+    with ``all_poses`` of the interpolated ones; its export.json says ``depth_png_per_unit``, steps a ``unit``.
     Raises InputError for a run without a map, OutputError where ``out`` cannot be written; it is whole or not there.
     """
-    gaussians = read_gaussians_ply(run.path / "gaussians.ply")
+    gaussians = gaussians_of(run)
     if kind == "spz":
         with writing(out):
             out.parent.mkdir(parents=True, exist_ok=True)
         with replacing(out) as part:
             write_gaussians_spz(part, gaussians)
         return out
-    lens, median_depth = lens_of(run), map_facts(run)["median_depth"]
+    lens, median_depth = lens_of(run), median_depth_of(run)
     splat = Splat(gaussians, NEAR_RATIO * median_depth)
     if kind == "flight":
         with writing(out):
@@ -98,7 +99,7 @@ def export_splat(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> 
     trajectory, per_unit = exported_poses(run, all_poses), depth_png_per_unit(median_depth)
     mapping = config_from_text(run.config, f"{run.path}/config.yaml").mapping
     map_view = MapView(lens, mapping.width_px, mapping.tau_uncertainty_px)
-    facts = {"kind": kind, "run": str(run.path.resolve()), "depth_png_per_unit": per_unit}
+    facts = {"kind": kind, "run": str(run.path.resolve()), "unit": run.unit, "depth_png_per_unit": per_unit}
     with export_folder(out, facts, []) as staged:
         for time_s, pose in zip(trajectory.timestamps_s, trajectory.world_from_cam, strict=True):
             depth = splat.render(pose, map_view.pinhole)[1]
@@ -116,9 +117,14 @@ def lens_of(run: Run) -> Camera | OpenCvLens:
     return OpenCvLens(c.fx_px, c.fy_px, c.cx_px, c.cy_px, c.width, c.height, run.distortion)
 
 
-def map_facts(run: Run) -> dict[str, Any]:
-    """What run.json says of the map. Raises InputError where there is none."""
+def gaussians_of(run: Run) -> GaussianArrays:
+    """The splat of a run, in the unit of its trajectory. Raises InputError where there is none."""
+    return read_gaussians_ply(run.path / "gaussians.ply").in_lengths(run.lengths)
+
+
+def median_depth_of(run: Run) -> float:
+    """What run.json says of the map, in the unit of the trajectory. Raises InputError where there is none."""
     facts = run.record.get("map")
     if not isinstance(facts, dict) or "median_depth" not in facts:
         raise InputError(f"{run.path}/run.json: expected what was written of the map (key map), got none")
-    return facts
+    return float(run.lengths * facts["median_depth"])

@@ -14,6 +14,7 @@ from ..camera.pinhole import Camera
 from ..camera.rectification import Rectifier
 from ..config import Config
 from ..graph.keyframe_graph import KeyframeGraph
+from ..metric.measure import Measure
 from ..parts import Parts
 from ..types import Source, StaticCloud
 from .smoothing import SmoothedMasks
@@ -40,6 +41,7 @@ class Tracked:
     parts: Parts
     rectifier: Rectifier | None
     map_device: str
+    scale: Measure | None = None  # what the metres are taken from
 
     def lens(self) -> Camera | OpenCvLens:
         """The lens over the photograph: the calibrated one where photographs are rectified."""
