@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -15,6 +15,7 @@ from ..concurrency import Future
 from ..config import Config
 from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.se3 import inverse, se3_exp, so3_log
+from ..graph.covisibility import overlap
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.prediction import rigid_flow_to
 from ..parts import Parts
@@ -25,7 +26,8 @@ from .two_view import Start, TwoView, TwoViewEstimator
 Array = NDArray[Any]
 LOOKED_AT = 4  # keyframes by small pictures, and as many by features, that an image is compared with
 LEAST_VIEWS = 2  # keyframes that must put an image at one place
-MOST_VIEWS = 3  # that its pose is found from
+ENOUGH_VIEWS, MOST_VIEWS = 3, 5  # that are looked for, and that its pose is found from
+LEAST_OVERLAP = 0.15  # share of a keyframe's points in view, for it to be searched from a pose
 AT_ONE_TURN, AT_ONE_SHIFT = 0.05, 0.05  # rad, and of the median depth: two keyframes that differ by less agree
 NEAR_TURN, NEAR_SHIFT = 0.5, 0.5  # the same for keyframes that may see what an image sees
 KERNEL_PX, ITERATIONS = 1.0, 20
@@ -82,21 +84,21 @@ class Localiser:
         It is believed where ``LEAST_VIEWS`` keyframes see it at one place, each by matches of its own.
         """
         prior = Future.done(moving)
-        group = [] if near is None else _agreeing(self.graph, list(self._tracked(work, prior, near)))
-        if len(group) >= LEAST_VIEWS:
+        if near is not None and len(group := self._tracked(work, prior, inverse(near.world_from_cam))) >= LEAST_VIEWS:
             return self._place(group)
         looked_at, seen, asked = self._candidates(work), list[_Seen](), set[int]()
         group = []
         for kf in looked_at:
             group = self._with(seen, asked, kf, work, prior, group)
-            if len(group) >= MOST_VIEWS:
+            if len(group) >= ENOUGH_VIEWS:
                 break
         for kf in self._around(group or seen, asked):
-            if len(group) >= MOST_VIEWS:
+            if len(group) >= ENOUGH_VIEWS:
                 break
             group = self._with(seen, asked, kf, work, prior, group)
         if len(group) >= LEAST_VIEWS:
-            return self._place(group)
+            again = self._tracked(work, prior, inverse(self._place(group).world_from_cam))
+            return self._place(again if len(again) >= LEAST_VIEWS else group)
         if not seen:
             return Unplaced(f"none of the {len(looked_at)} keyframes most like it shows its place")
         return Unplaced(f"no {LEAST_VIEWS} of the {len(asked)} keyframes compared put it at one place")
@@ -134,15 +136,20 @@ class Localiser:
         near = [k for k, (turn, shift) in apart.items() if turn < NEAR_TURN and shift < NEAR_SHIFT and k not in asked]
         return [graph.keyframes[k] for k in sorted(near, key=lambda k: sum(apart[k]))[:LOOKED_AT]]
 
-    def _tracked(self, work: WorkFrame, prior: Future[Array], near: Place) -> Iterator[_Seen]:
-        """The image seen from the keyframes that saw the one before, searched from its pose."""
-        graph, before = self.graph, inverse(near.world_from_cam)
-        for k in near.keyframes:
-            start = Start(rigid_flow_to(graph, k, before), near=True)
-            guess = before @ inverse(graph.variables[k].cam_from_world)
+    def _tracked(self, work: WorkFrame, prior: Future[Array], cam_from_world: Array) -> list[_Seen]:
+        """The image seen from the keyframes that see most from about its pose (4, 4), searched from there; those that
+        agree."""
+        graph = self.graph
+        seen = {k: overlap(graph, k, cam_from_world) for k in graph.members()}
+        best = sorted(seen, key=lambda k: seen[k][1] - seen[k][0])[:MOST_VIEWS]
+        views = []
+        for k in (k for k in best if seen[k][0] >= LEAST_OVERLAP):
+            start = Start(rigid_flow_to(graph, k, cam_from_world), near=True)
+            guess = cam_from_world @ inverse(graph.variables[k].cam_from_world)
             view = self.two_view.estimate(graph.keyframes[k], work, prior, start, guess)
             if self.two_view.accepted(view):
-                yield self._seen(view)
+                views.append(self._seen(view))
+        return _agreeing(graph, views)
 
     def _place(self, group: list[_Seen]) -> Place:
         """One pose from the matches of all keyframes that agree."""
