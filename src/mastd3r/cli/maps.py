@@ -50,7 +50,7 @@ def save(args: argparse.Namespace, console: Console) -> int:
 
 def localise(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r localise``."""
-    from ..offline.localise import Located, localise_source
+    from ..offline.localise import localise_source
     from ..pipeline import load_map
     from .commands import reporter_of
 
@@ -62,6 +62,6 @@ def localise(args: argparse.Namespace, console: Console) -> int:
         screen().print(Text(f"{one.name}: {one.said}"), soft_wrap=True)
     if len(located) > SHOWN:
         screen().print(f"and {len(located) - SHOWN} more", markup=False)
-    found = sum(one.is_found for one in located)
+    found = sum(one.place.is_found for one in located)
     screen().print(f"found {found} of {len(located)}; wrote {args.out}", soft_wrap=True, markup=False)
     return 0

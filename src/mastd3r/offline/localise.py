@@ -39,11 +39,6 @@ class Located:
     place: Place | Unplaced
 
     @property
-    def is_found(self) -> bool:
-        """Whether it has a place in the map."""
-        return isinstance(self.place, Place)
-
-    @property
     def said(self) -> str:
         """For people."""
         if isinstance(self.place, Unplaced):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,12 @@ from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.prediction import rigid_flow_to
 from ..parts import Parts
 from ..types import USABLE_WEIGHT, WorkFrame
-from .places import most_alike
+from .places import most_alike, not_unlike
 from .two_view import Start, TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
 LOOKED_AT = 4  # keyframes by small pictures, and as many by features, that an image is compared with
+LEAST_ALIKE = 0.02  # share of features that both have; where a map's edge is seen it is small, elsewhere below 0.02
 LEAST_VIEWS = 2  # keyframes that must put an image at one place
 ENOUGH_VIEWS, MOST_VIEWS = 3, 5  # that are looked for, and that its pose is found from
 LEAST_OVERLAP = 0.15  # share of a keyframe's points in view, for it to be searched from a pose
@@ -44,6 +45,7 @@ class Place:
     keyframes: tuple[int, ...]  # that agree on it, the best first
     inliers: int  # matches within INLIER_PX of where the pose puts them
     inlier_ratio: float  # share of the matches
+    is_found: ClassVar[bool] = True
 
     @property
     def position_sigma(self) -> float:
@@ -61,6 +63,7 @@ class Unplaced:
     """Why an image has no place in the map."""
 
     reason: str
+    is_found: ClassVar[bool] = False
 
 
 @dataclass(frozen=True)
@@ -99,6 +102,8 @@ class Localiser:
         if len(group) >= LEAST_VIEWS:
             again = self._tracked(work, prior, inverse(self._place(group).world_from_cam))
             return self._place(again if len(again) >= LEAST_VIEWS else group)
+        if not looked_at:
+            return Unplaced("no keyframe looks like it")
         if not seen:
             return Unplaced(f"none of the {len(looked_at)} keyframes most like it shows its place")
         return Unplaced(f"no {LEAST_VIEWS} of the {len(asked)} keyframes compared put it at one place")
@@ -121,8 +126,8 @@ class Localiser:
     def _candidates(self, work: WorkFrame) -> list[Keyframe]:
         """By small pictures and by features in turn, none twice."""
         graph, ids = self.graph, self.graph.members()
-        by_features = most_alike(self.parts, graph, work, ids, LOOKED_AT)
-        by_picture = self.parts.places.best(graph, work, ids, LOOKED_AT)
+        by_features = most_alike(self.parts, graph, work, ids, LOOKED_AT, LEAST_ALIKE)
+        by_picture = not_unlike(self.parts, work, self.parts.places.best(graph, work, ids, LOOKED_AT), LEAST_ALIKE)
         both = [kf for n in range(LOOKED_AT) for found in (by_features, by_picture) for kf in found[n : n + 1]]
         return list({kf.id: kf for kf in both}.values())
 
