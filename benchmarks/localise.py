@@ -4,8 +4,8 @@
 
 A map is made of the first frames of a sequence (``mastd3r run --end … --no-map``, ``save_map``). Every image is looked
 for by itself, without the one before it; "as a video" is the same with it. The map is brought to the truth by one
-Sim(3) over the poses of the frames that it was made of. Wrong: found farther than 0.1 m or 5 degrees from where it was taken, or in
-a place where it was not taken at all. Entries of an existing file that are not measured again stay.
+Sim(3) over the poses of the frames that it was made of. Wrong: found farther than 0.1 m or 5 degrees from where it was
+taken, or in a place where it was not taken at all. Entries of an existing file that are not measured again stay.
 """
 
 from __future__ import annotations
@@ -97,9 +97,7 @@ def _made(case: Case, data: Path, folder: Path) -> tuple[mastd3r.Reconstruction,
     return rec, mastd3r.save_map(rec, path)
 
 
-def _errors(
-    rec: mastd3r.Reconstruction, source: Source, times_s: Array, places: list[Place | None]
-) -> dict[str, Any]:
+def _errors(rec: mastd3r.Reconstruction, source: Source, times_s: Array, places: list[Place | None]) -> dict[str, Any]:
     truth = source.truth()
     assert truth is not None
     rows, true_rows = associate(rec.timestamps_s, truth.timestamps_s, 0.02)

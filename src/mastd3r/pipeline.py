@@ -44,9 +44,7 @@ def load(path: str | Path) -> Reconstruction:
 
 
 @one_blas_thread()
-def save_map(
-    run: str | Path | Reconstruction, out: str | Path, *, source: str | Path | None = None
-) -> SavedMap:
+def save_map(run: str | Path | Reconstruction, out: str | Path, *, source: str | Path | None = None) -> SavedMap:
     """Keep what images can be found in later, as ``mastd3r save``: the keyframes of a run, their points, its splat.
 
     run: its folder, or what came of it. out: the map's folder; an earlier map there is replaced, anything else is

@@ -9,7 +9,6 @@ from rich.console import Console
 from rich.text import Text
 
 from ..config import SourceConfig, SourceKind
-from ..errors import ConfigError
 from .options import numbers_of, path
 from .screen import screen
 

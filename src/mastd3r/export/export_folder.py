@@ -16,7 +16,6 @@ from .claim import ANOTHER, refuse_inputs
 from .files import write_json, writing
 
 
-
 @dataclass(frozen=True)
 class FolderKind:
     """How a folder of ours is known again: one kind never takes the place of another."""
@@ -36,8 +35,8 @@ def export_folder(
     """A new folder beside ``out`` for the body to write in; it takes the place of ``out`` once the body is done.
 
     Where the body stops, nothing of it stays. ``out`` may be missing, empty, or an earlier folder of the same ``kind``
-    with nothing added. ``facts`` go to its record; ``inputs`` are what is read. Raises OutputError, before anything is written, for
-    any other folder, a symbolic link, and one that holds an input or lies in one.
+    with nothing added. ``facts`` go to its record, as they are when the body is done; ``inputs`` are what is read.
+    Raises OutputError, before anything is written, for any other folder, a symbolic link, and one that holds an input or lies in one.
     """
     with writing(out):
         refuse_inputs(out, inputs)

@@ -22,7 +22,7 @@ from ..reading.files import is_file
 from ..sources import open_source
 from ..sources.image_files import IMAGE_SUFFIXES, read_rgb
 from ..tracking.localisation import Place, Unplaced
-from ..types import Frame, Trajectory
+from ..types import Frame, State, Trajectory
 from .saved_map import SavedMap
 
 Array = NDArray[Any]
@@ -97,8 +97,8 @@ def localise_source(
         facts["counts"] = Counter(image["state"] for image in facts["images"])
         found = [(one.timestamp_s, one.place) for one in located if isinstance(one.place, Place)]
         poses = np.array([p.world_from_cam for _, p in found]).reshape(-1, 4, 4)
-        times_s = np.array([t for t, _ in found])
-        write_tum(staged / POSES, Trajectory(times_s, poses, ("tracked",) * len(found), np.zeros(len(found), bool)))
+        times_s, states = np.array([t for t, _ in found]), tuple[State, ...](["tracked"] * len(found))
+        write_tum(staged / POSES, Trajectory(times_s, poses, states, np.zeros(len(found), bool)))
     return located
 
 

@@ -128,7 +128,7 @@ class SavedMap:
         seen = cv2.remap(image, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         inside = ((at >= -0.5) & (at <= np.array([small.width, small.height]) - 0.5)).all(-1)
         work = self._eye.provider.look(Frame(self._looked, 0.0, seen))
-        return work, (~inside).astype(np.float32)
+        return work, np.asarray(~inside, np.float32)
 
 
 def graph_of(record: MapRecord, config: Config, camera: Camera) -> KeyframeGraph:

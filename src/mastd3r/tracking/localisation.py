@@ -109,7 +109,13 @@ class Localiser:
         return Unplaced(f"no {LEAST_VIEWS} of the {len(asked)} keyframes compared put it at one place")
 
     def _with(
-        self, seen: list[_Seen], asked: set[int], kf: Keyframe, work: WorkFrame, prior: Future[Array], group: list[_Seen]
+        self,
+        seen: list[_Seen],
+        asked: set[int],
+        kf: Keyframe,
+        work: WorkFrame,
+        prior: Future[Array],
+        group: list[_Seen],
     ) -> list[_Seen]:
         """The largest group that agrees, once a keyframe more has been asked."""
         asked.add(kf.id)

@@ -100,9 +100,7 @@ def confirmed(two_view: TwoViewEstimator, work: WorkFrame, view: TwoView, prior:
     return False
 
 
-def not_unlike(
-    parts: Parts, work: WorkFrame, candidates: Sequence[Keyframe], least: float = UNLIKE
-) -> list[Keyframe]:
+def not_unlike(parts: Parts, work: WorkFrame, candidates: Sequence[Keyframe], least: float = UNLIKE) -> list[Keyframe]:
     """Without those that share next to no feature with a frame: to look at each closely costs a hundred times more."""
     if not candidates:
         return []
