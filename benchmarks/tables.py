@@ -3,7 +3,7 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a
+live.json, localise.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a
 folder plots beside the page, the curve of the stress suite beside it.
 """
 
@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
 from dense_table import dense
 from live_table import live
+from localise_table import localise
 from map_tables import map_sections
 from masks_tables import masks
 from networks_table import networks
@@ -90,6 +91,7 @@ def main() -> int:
     lines += map_sections(source.parent)
     lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
+    lines += localise(source.parent / "localise.json")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")

@@ -36,7 +36,8 @@ def export_folder(
 
     Where the body stops, nothing of it stays. ``out`` may be missing, empty, or an earlier folder of the same ``kind``
     with nothing added. ``facts`` go to its record, as they are when the body is done; ``inputs`` are what is read.
-    Raises OutputError, before anything is written, for any other folder, a symbolic link, and one that holds an input or lies in one.
+    Raises OutputError, before anything is written, for any other folder, a symbolic link, and one that holds an input
+    or lies in one.
     """
     with writing(out):
         refuse_inputs(out, inputs)

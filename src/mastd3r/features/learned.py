@@ -95,7 +95,7 @@ class LearnedFeatures:
             return [self._described(image) for image in images]
 
     def take_descriptions(self, images: Sequence[Array], described: Sequence[tuple[Array, Array]]) -> None:
-        """Images (h, w) of a map and what ``descriptions`` gave of them, kept as long as this is; reads the networks."""
+        """Images (h, w) of a map, and what ``descriptions`` gave of them: kept to the end. Reads the networks."""
         self._networks_loaded()
         for image, (px, descriptors) in zip(images, described, strict=True):
             self._kept[id(image)] = (image, px.astype(np.float32), descriptors.astype(np.float32))

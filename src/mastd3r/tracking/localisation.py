@@ -33,6 +33,7 @@ AT_ONE_TURN, AT_ONE_SHIFT = 0.05, 0.05  # rad, and of the median depth: two keyf
 NEAR_TURN, NEAR_SHIFT = 0.5, 0.5  # the same for keyframes that may see what an image sees
 KERNEL_PX, ITERATIONS = 1.0, 20
 INLIER_PX = 2.0
+DEPTH_NOISE = 5.0  # the same of depths, which many keyframes measure by one patch: held to them, far poses bend
 NOISE = 20.0  # errors of matches are alike within a view: so many times one match's, as in graph/focal_sigma.py
 
 
@@ -170,7 +171,8 @@ class Localiser:
         for seen in group:
             v, k = graph.variables[seen.view.anchor.id], seen.view.anchor.id
             target, weight = seen.view.pair.matches.new_px, seen.view.weight
-            matches = StaticMatches(v.px, v.inv_depth, graph.depth_info(k), target, weight, graph.intrinsics.values)
+            info = graph.depth_info(k) / DEPTH_NOISE**2
+            matches = StaticMatches(v.px, v.inv_depth, info, target, weight, graph.intrinsics.values)
             terms.append((matches, inverse(v.cam_from_world)))
         start = _Pose(tuple(terms), group[0].cam_from_world)
         end = levenberg_marquardt(start, Damping(), iterations=ITERATIONS, tolerance=1e-6).estimate
