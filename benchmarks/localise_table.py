@@ -10,8 +10,8 @@ HEAD = (
     "By `python benchmarks/localise.py --data DATA --out {path} --stride {stride}`: a map of the first frames of a "
     "sequence, later images looked for in it one by one. Near: within 2 cm and 1 degree of the truth, after one Sim(3) "
     "over the poses of the map's own frames. Wrong: off by more than 10 cm or 5 degrees, or found in a place where it "
-    "was not taken. Within 2 sigma: by the uncertainty that is said, errors of the map included in the error and not in "
-    "the sigma. By fifths: found and near of each fifth of the images in order of time, as the camera leaves the map."
+    "was not taken. Within 2 sigma: by the uncertainty that is said; errors of the map are in the error and not in the "
+    "sigma. By fifths: found and near of each fifth of the images in order of time, as the camera leaves the map."
 )
 
 

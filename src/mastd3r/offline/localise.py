@@ -98,8 +98,8 @@ def localise_source(
         found = [(one.timestamp_s, one.place) for one in located if isinstance(one.place, Place)]
         poses = np.array([p.world_from_cam for _, p in found]).reshape(-1, 4, 4)
         times_s = np.array([t for t, _ in found])
-        states: tuple[State, ...] = ("tracked",) * len(found)
-        write_tum(staged / POSES, Trajectory(times_s, poses, states, np.zeros(len(found), bool)))
+        states: list[State] = ["tracked"] * len(found)
+        write_tum(staged / POSES, Trajectory(times_s, poses, tuple(states), np.zeros(len(found), bool)))
     return located
 
 
