@@ -20,6 +20,7 @@ from mastd3r.camera.opencv_lens import OpenCvLens
 from mastd3r.camera.pinhole import Camera
 from mastd3r.cli.main import main
 from mastd3r.config import Config, config_to_yaml
+from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.run_folder import RunFolder
 from mastd3r.export.tracks import Tracks
 from mastd3r.geometry.se3 import inverse, so3_log, transform
@@ -195,6 +196,18 @@ def test_a_lens_of_more_than_radial_terms_is_rectified(tmp_path: Path) -> None:
         world = transform(pose, graph.camera().unproject(graph.variables[n].px, graph.variables[n].inv_depth))[known]
         away = np.linalg.norm(world[:, None] - made.tracks.points_world[None], axis=2).min(1)
         assert known.sum() > 80 and away.max() < 0.02
+
+
+def test_features_without_descriptions_and_images_of_another_shape(tmp_path: Path) -> None:
+    made = made_run(tmp_path, Camera.centred(300.0, 160, 120))
+    (made.path / "config.yaml").write_text("features: orb\n")
+    saved = mastd3r.save_map(made.path, tmp_path / "map")
+    assert json.loads((tmp_path / "map" / "map.json").read_text())["features"] == ""
+    assert isinstance(saved.localise(blobs(6, 160, 120)[5]), Unplaced)
+    with pytest.raises(InputError, match="of the map's lens, 160x120 or of that shape, got 160x160"):
+        saved.localise(blobs(1, 160, 160)[0])
+    with pytest.raises(ConfigError, match="--intrinsics"):
+        saved.localise(blobs(1, 160, 160)[0], intrinsics=(-3.0,))
 
 
 # -- files that are not what they should be --------------------------------------------------------------------------
