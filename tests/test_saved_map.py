@@ -26,7 +26,7 @@ from mastd3r.export.tracks import Tracks
 from mastd3r.geometry.se3 import inverse, so3_log, transform
 from mastd3r.sources import synthetic
 from mastd3r.tracking.localisation import Place, Unplaced
-from mastd3r.types import Trajectory
+from mastd3r.types import State, Trajectory
 
 Array = NDArray[Any]
 WIDTH, HEIGHT = 200, 150
@@ -198,11 +198,13 @@ def test_a_lens_of_more_than_radial_terms_is_rectified(tmp_path: Path) -> None:
         assert known.sum() > 80 and away.max() < 0.02
 
 
-def test_features_without_descriptions_and_images_of_another_shape(tmp_path: Path) -> None:
-    made = made_run(tmp_path, Camera.centred(300.0, 160, 120))
+def test_features_without_descriptions_guessed_poses_and_images_of_another_shape(tmp_path: Path) -> None:
+    states: tuple[State, ...] = ("started", "tracked", "interpolated", "tracked", "tracked")
+    made = made_run(tmp_path, Camera.centred(300.0, 160, 120), states)
     (made.path / "config.yaml").write_text("features: orb\n")
     saved = mastd3r.save_map(made.path, tmp_path / "map")
     assert json.loads((tmp_path / "map" / "map.json").read_text())["features"] == ""
+    assert np.allclose(saved.timestamps_s, made.trajectory.timestamps_s[[0, 4]])  # of keyframes 0, 2 and 4
     assert isinstance(saved.localise(blobs(6, 160, 120)[5]), Unplaced)
     with pytest.raises(InputError, match="of the map's lens, 160x120 or of that shape, got 160x160"):
         saved.localise(blobs(1, 160, 160)[0])

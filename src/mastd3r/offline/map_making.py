@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +28,6 @@ from .photographs import check_size
 from .renders import lens_of
 
 Array = NDArray[Any]
-log = logging.getLogger(__name__)
 STEP = 1e-3  # relative, of an inverse depth: over it a projection is taken to be straight
 
 
@@ -47,11 +45,10 @@ def map_of(run: Run, source: Source, config: Config) -> MapRecord:
     """The same as a value."""
     lens, tracks = lens_of(run), read_tracks(run.path / "tracks.npz")
     check_size(run, source, lens)
-    keyframes = run.trajectory.keyframes()
+    keyframes = run.trajectory.tracked().keyframes()  # poses that were guessed are no map
     if len(keyframes.timestamps_s) < 2 or not len(tracks.point):
-        count = len(keyframes.timestamps_s)
-        raise InputError(f"{run.path}: expected keyframes with points of known depth, got {count} keyframes and "
-                         f"{len(tracks.points_world)} points")  # fmt: skip
+        got = f"{len(keyframes.timestamps_s)} keyframes and {len(tracks.points_world)} points"
+        raise InputError(f"{run.path}: expected keyframes with points of known depth, got {got}")
     eye = WorkingEye(lens, config)
     works = _work_frames(run, keyframes, source, eye)
     points = _PointsOfKeyframes(tracks, keyframes, eye)
@@ -172,12 +169,9 @@ class _PointsOfKeyframes:
 
 def _keyframe(work: WorkFrame, world_from_cam: Array, points: tuple[Array, Array, Array], moving: Array) -> MapKeyframe:
     px, inv_depth, info = points
-    none = np.zeros((0, 2), np.float32)
-    texture = work.texture.astype(np.float32)
-    empty = none.astype(np.float16)
-    return MapKeyframe(
-        work.timestamp_s, world_from_cam, work.gray, moving, px, texture, inv_depth, info, none, empty
-    )  # fmt: skip
+    none, texture = np.zeros((0, 2), np.float32), work.texture.astype(np.float32)
+    points_of = (px, texture, inv_depth, info)
+    return MapKeyframe(work.timestamp_s, world_from_cam, work.gray, moving, *points_of, none, none.astype(np.float16))
 
 
 def _described(config: Config, eye: WorkingEye, works: list[WorkFrame]) -> tuple[str, list[tuple[Array, Array]]]:
