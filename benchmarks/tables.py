@@ -3,8 +3,8 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of each bench under its suite's
-name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
+live.json, localise.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of each bench
+under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
 from dense_table import dense
 from live_table import live
+from localise_table import localise
 from map_tables import map_sections
 from masks_tables import masks
 from metric_table import metric_scale
@@ -92,6 +93,7 @@ def main() -> int:
     lines += metric_scale(source.parent / "metric_scale.json")
     lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
+    lines += localise(source.parent / "localise.json")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")

@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from .live.loop import LiveFrame, LiveLoop
     from .live.run import run_live
     from .offline.reconstruction import Reconstruction
-    from .pipeline import evaluate_trajectory, finish_live, load, reconstruct
+    from .offline.saved_map import SavedMap
+    from .pipeline import evaluate_trajectory, finish_live, load, load_map, reconstruct, save_map
     from .slam import Slam, TrackResult
     from .sources.camera import CameraOptions, open_camera
     from .tracking.state import Status
@@ -36,6 +37,7 @@ __all__ = [
     "MissingPackage",
     "OutputError",
     "Reconstruction",
+    "SavedMap",
     "Slam",
     "SlamError",
     "Status",
@@ -44,9 +46,11 @@ __all__ = [
     "evaluate_trajectory",
     "finish_live",
     "load",
+    "load_map",
     "open_camera",
     "reconstruct",
     "run_live",
+    "save_map",
 ]
 _HOME = {
     "CameraOptions": "sources.camera",
@@ -58,6 +62,7 @@ _HOME = {
     "MissingPackage": "errors",
     "OutputError": "errors",
     "Reconstruction": "offline.reconstruction",
+    "SavedMap": "offline.saved_map",
     "Slam": "slam",
     "SlamError": "errors",
     "Status": "tracking.state",
@@ -65,9 +70,11 @@ _HOME = {
     "evaluate_trajectory": "pipeline",
     "finish_live": "pipeline",
     "load": "pipeline",
+    "load_map": "pipeline",
     "open_camera": "sources.camera",
     "reconstruct": "pipeline",
     "run_live": "live.run",
+    "save_map": "pipeline",
 }
 
 

@@ -25,6 +25,7 @@ from .export.trajectory_files import read_trajectory
 from .metric.spec import absolute
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
+from .offline.saved_map import SavedMap
 from .offline.tracked import MapMaterial
 from .parts import with_dataset_lens
 from .progress import Reporter, Silent
@@ -41,6 +42,25 @@ log = logging.getLogger(__name__)
 def load(path: str | Path) -> Reconstruction:
     """A run folder that was written earlier, complete or not. Raises InputError where it is none."""
     return Reconstruction(user_path(path))
+
+
+@one_blas_thread()
+def save_map(run: str | Path | Reconstruction, out: str | Path, *, source: str | Path | None = None) -> SavedMap:
+    """Keep what images can be found in later, as ``mastd3r save``: the keyframes of a run, their points, its splat.
+
+    run: its folder, or what came of it. out: the map's folder; an earlier map there is replaced, anything else is
+    refused. source: where the photographs are, if no longer where the run read them.
+    Raises InputError for a run without keyframes or points, and OutputError; nothing half-written stays.
+    """
+    rec = run if isinstance(run, Reconstruction) else load(run)
+    path = user_path(out, "out")
+    rec.save_map(path, source)
+    return SavedMap(path)
+
+
+def load_map(path: str | Path) -> SavedMap:
+    """A map that ``save_map`` wrote. Raises InputError for another folder or version, and for a damaged one."""
+    return SavedMap(user_path(path))
 
 
 @one_blas_thread()

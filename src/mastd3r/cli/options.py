@@ -53,7 +53,7 @@ def config_from_args(args: argparse.Namespace) -> Config:
     if args.intrinsics == "dataset":
         config = replace(config, camera=replace(config.camera, intrinsics=(), from_dataset=True))
     elif args.intrinsics is not None:
-        given = _numbers(args.intrinsics)
+        given = numbers_of(args.intrinsics)
         config = replace(config, camera=replace(config.camera, intrinsics=given, from_dataset=False))
     return check_config(config)
 
@@ -65,7 +65,8 @@ def checked_minutes(minutes: float, option: str) -> float:
     return minutes
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def numbers_of(text: str) -> tuple[float, ...]:
+    """What ``--intrinsics`` says. Raises ConfigError for what are no numbers."""
     try:
         numbers = tuple(float(x) for x in text.replace(",", " ").split())
     except ValueError as e:

@@ -20,6 +20,7 @@ from .bench import bench_parser
 from .compile import PARTS, compile_kernels
 from .download import download_parser
 from .live import finish_parser, live_parser
+from .maps import localise_parser, save_parser
 from .options import path
 from .view import view_parser
 from .weights import weights_parser
@@ -81,6 +82,8 @@ def parser() -> argparse.ArgumentParser:
     live_parser(known.add_parser("live", help="track a camera, stream or recording while it runs"))
     finish_parser(known.add_parser("finish", help="offline masks, cloud and map of a live run that kept its frames"))
     _map_parser(known.add_parser("map", help="go on with the map of a run that has ended"))
+    save_parser(known.add_parser("save", help="keep the keyframes of a run as a map that images are found in"))
+    localise_parser(known.add_parser("localise", help="where in a saved map images were taken"))
     demo = known.add_parser("demo", help="make a small clip with a moving object and run the whole job on it")
     demo.add_argument("--out", type=path, default=Path("runs/demo"), help="run folder (default runs/demo)")
     demo.add_argument("--frames", type=int, default=90, help="frames of the clip (default 90)")

@@ -1,4 +1,4 @@
-"""The folder that an export writes: whole or not at all, and never at the cost of anybody's files."""
+"""The folder that an export or a saved map is: whole or not at all, and never at the cost of anybody's files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,28 +15,40 @@ from ..reading.files import whole_json
 from .claim import ANOTHER, refuse_inputs
 from .files import write_json, writing
 
-RECORD = "export.json"  # of an export: what it is, and the files that it wrote
-MADE_BY = "mastd3r export"
+
+@dataclass(frozen=True)
+class FolderKind:
+    """How a folder of ours is known again: one kind never takes the place of another."""
+
+    record: str  # its JSON file: what it is, and the files that it wrote
+    made_by: str
+    said: str  # in messages
+
+
+EXPORT = FolderKind("export.json", "mastd3r export", "an earlier export")
 
 
 @contextmanager
-def export_folder(out: Path, facts: Mapping[str, Any], inputs: Sequence[Path]) -> Iterator[Path]:
+def export_folder(
+    out: Path, facts: Mapping[str, Any], inputs: Sequence[Path], kind: FolderKind = EXPORT
+) -> Iterator[Path]:
     """A new folder beside ``out`` for the body to write in; it takes the place of ``out`` once the body is done.
 
-    Where the body stops, nothing of it stays. ``out`` may be missing, empty, or an earlier export with nothing added.
-    ``facts`` go to its export.json; ``inputs`` are what is read. Raises OutputError, before anything is written, for
-    any other folder, a symbolic link, and one that holds an input or lies in one.
+    Where the body stops, nothing of it stays. ``out`` may be missing, empty, or an earlier folder of the same ``kind``
+    with nothing added. ``facts`` go to its record, as they are when the body is done; ``inputs`` are what is read.
+    Raises OutputError, before anything is written, for any other folder, a symbolic link, and one that holds an input
+    or lies in one.
     """
     with writing(out):
         refuse_inputs(out, inputs)
-        _check(out)
+        _check(out, kind)
         out.parent.mkdir(parents=True, exist_ok=True)
         staged = out.with_name(f".{out.name}.{os.getpid()}.part")
         staged.mkdir()
         try:
             yield staged
             files = sorted(p.relative_to(staged).as_posix() for p in staged.rglob("*") if p.is_file())
-            write_json(staged / RECORD, {"made_by": MADE_BY, **facts, "files": files})
+            write_json(staged / kind.record, {"made_by": kind.made_by, **facts, "files": files})
             _replace(out, staged)
         except BaseException:
             with suppress(OSError):
@@ -43,29 +56,29 @@ def export_folder(out: Path, facts: Mapping[str, Any], inputs: Sequence[Path]) -
             raise
 
 
-def _check(out: Path) -> None:
-    """Raise OutputError for a place where something else than an earlier export is."""
+def _check(out: Path, kind: FolderKind) -> None:
+    """Raise OutputError for a place where something else than an earlier folder of this kind is."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         what = "a symbolic link" if out.is_symlink() else "a file"
         raise OutputError(f"{out}: expected to write a folder, got {what}; {ANOTHER}")
     if not out.exists() or not any(out.iterdir()):
         return
-    ours = _files_of(out)
+    ours = _files_of(out, kind)
     added = [p for p in sorted(out.rglob("*")) if not p.is_dir() and p.relative_to(out).as_posix() not in ours]
     if added:
         first = added[0].relative_to(out).as_posix()
-        raise OutputError(f"{out}: expected an empty folder or an earlier export, got one with {first}; {ANOTHER}")
+        raise OutputError(f"{out}: expected an empty folder or {kind.said}, got one with {first}; {ANOTHER}")
 
 
-def _files_of(out: Path) -> set[str]:
-    """Files that an earlier export wrote; empty where there was none."""
+def _files_of(out: Path, kind: FolderKind) -> set[str]:
+    """Files that an earlier one wrote; empty where there was none."""
     try:
-        record = whole_json(out / RECORD)
+        record = whole_json(out / kind.record)
     except InputError:
         return set()
-    if record.get("made_by") != MADE_BY or not isinstance(record.get("files"), list):
+    if record.get("made_by") != kind.made_by or not isinstance(record.get("files"), list):
         return set()
-    return {RECORD, *map(str, record["files"])}
+    return {kind.record, *map(str, record["files"])}
 
 
 def _replace(out: Path, staged: Path) -> None:

@@ -61,6 +61,7 @@ class LearnedFeatures:
         self._load = load
         self._networks: tuple[FeatureNetwork, MatchNetwork] | None = None
         self._seen: OrderedDict[int, tuple[Array, Array, Array]] = OrderedDict()  # id of an image: it, its features
+        self._kept: dict[int, tuple[Array, Array, Array]] = {}  # the same of a map's keyframes
         self._pairs: OrderedDict[tuple[int, int], tuple[Any, Rows]] = (
             OrderedDict()
         )  # of two images: what the network says
@@ -87,6 +88,17 @@ class LearnedFeatures:
         with self._one_at_a_time, one_torch_thread():
             described = [self._described(a)[1][:FEATURES_OF_A_PLACE] for a in (image, *others)]
         return np.array([_common(described[0], d) for d in described[1:]])
+
+    def descriptions(self, images: Sequence[Array]) -> list[tuple[Array, Array]]:
+        """(n, 2) pixels and (n, c) descriptors of each image; reads the networks, so that ``alike`` is asked after."""
+        with self._one_at_a_time, one_torch_thread():
+            return [self._described(image) for image in images]
+
+    def take_descriptions(self, images: Sequence[Array], described: Sequence[tuple[Array, Array]]) -> None:
+        """Images (h, w) of a map, and what ``descriptions`` gave of them: kept to the end. Reads the networks."""
+        self._networks_loaded()
+        for image, (px, descriptors) in zip(images, described, strict=True):
+            self._kept[id(image)] = (image, px.astype(np.float32), descriptors.astype(np.float32))
 
     def memory(self, frames: Sequence[WorkFrame]) -> FeatureMemory:
         """What later answers depend on; of pairs those of ``frames``, the only ones that can be asked for again."""
@@ -131,6 +143,8 @@ class LearnedFeatures:
 
     def _described(self, image: Array) -> tuple[Array, Array]:
         key = id(image)
+        if key in self._kept:
+            return self._kept[key][1:]
         if key not in self._seen:
             found = self._networks_loaded()[0].describe(image, MOST_FEATURES)
             self._seen[key] = (image, *found)

@@ -39,6 +39,7 @@ from ..types import StaticCloud
 from .continued_map import continue_map
 from .dense import CLOUD_FILE, export_dense
 from .exports import export_pictures, export_plates
+from .map_making import save_run_as_map
 from .metres import material_of_run, scale_facts
 from .renders import export_splat, lens_of
 from .run_report import write_run_report
@@ -271,6 +272,12 @@ class Reconstruction:
         settle(target, also_incomplete=True)
         self._run, self._temporary = read_run(target), None
         return target
+
+    def save_map(self, out: Path, source: str | Path | None = None) -> None:
+        """See ``pipeline.save_map``."""
+        path = self._photographs(source)
+        opened = open_source(path, self.config.source, want_semantic=False)
+        save_run_as_map(self._run, opened, path, self.config, out)
 
     @one_blas_thread()
     def export(

@@ -27,9 +27,9 @@ SAME_TURN, SAME_SHIFT = 0.1, 0.15  # rad, and of the median depth, by which two 
 
 
 def most_alike(
-    parts: Parts, graph: KeyframeGraph, work: WorkFrame, among: Sequence[int], count: int = 1
+    parts: Parts, graph: KeyframeGraph, work: WorkFrame, among: Sequence[int], count: int = 1, least: float = MIN_ALIKE
 ) -> list[Keyframe]:
-    """Up to ``count`` keyframes of ``among`` that share most features with a frame, best first.
+    """Up to ``count`` keyframes of ``among`` that share most features with a frame, ``least`` or more, best first.
 
     Beside place recognition, whose small pictures change with where one stands; nothing is believed before it is
     verified. None where the features have no opinion.
@@ -39,7 +39,7 @@ def most_alike(
     ids = list(among)[:: 1 + len(among) // MOST_COMPARED]
     share = parts.features.alike(work.gray, [graph.keyframes[k].work.gray for k in ids])
     first = np.argsort(-np.nan_to_num(share), kind="stable")[:count]
-    return [graph.keyframes[ids[n]] for n in first if share[n] >= MIN_ALIKE]
+    return [graph.keyframes[ids[n]] for n in first if share[n] >= least]
 
 
 def candidates(
@@ -100,9 +100,9 @@ def confirmed(two_view: TwoViewEstimator, work: WorkFrame, view: TwoView, prior:
     return False
 
 
-def not_unlike(parts: Parts, work: WorkFrame, candidates: Sequence[Keyframe]) -> list[Keyframe]:
+def not_unlike(parts: Parts, work: WorkFrame, candidates: Sequence[Keyframe], least: float = UNLIKE) -> list[Keyframe]:
     """Without those that share next to no feature with a frame: to look at each closely costs a hundred times more."""
     if not candidates:
         return []
     share = parts.features.alike(work.gray, [kf.work.gray for kf in candidates])
-    return [kf for kf, s in zip(candidates, share, strict=True) if not s < UNLIKE]
+    return [kf for kf, s in zip(candidates, share, strict=True) if not s < least]

@@ -1,0 +1,157 @@
+"""A saved map that has been loaded: its keyframes as the graph that images are found in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..camera.opencv_lens import OpenCvLens, lens_from_intrinsics
+from ..camera.pinhole import Camera
+from ..concurrency import one_blas_thread
+from ..config import Config, config_from_text
+from ..dynamics.soft_mask import static_at
+from ..errors import ConfigError, InputError
+from ..export.map_folder import SPLAT, MapRecord, read_map
+from ..geometry.se3 import inverse
+from ..graph.intrinsics import Intrinsics, as_given, inverse_radial
+from ..graph.keyframe_graph import KeyframeGraph
+from ..mapping.gaussians import GaussianArrays
+from ..mapping.ply import read_gaussians_ply
+from ..parts import chosen_features, parts_of
+from ..reading.files import is_file
+from ..sources.checks import frame_is_blank
+from ..tracking.localisation import Localiser, Place, Unplaced
+from ..types import Frame, WorkFrame
+from .map_making import WorkingEye
+
+Array = NDArray[Any]
+SAME_SHAPE = 0.01  # by which width / height of an image may differ from that of the map's photographs
+
+
+class SavedMap:
+    """A map of one world: keyframes, their points and poses, the lens, perhaps a splat. Lengths are map units."""
+
+    def __init__(self, path: Path) -> None:
+        """``path``: its folder. Raises InputError, ConfigError for one that is none, or is damaged."""
+        self.path, self._record = path, read_map(path)
+        config = config_from_text(self._record.config, f"{path}/config.yaml")
+        self._eye = WorkingEye(self._record.lens, config)
+        if self._eye.provider.size != self._record.size:
+            raise InputError(
+                f"{path}: expected working images of {self._eye.provider.size}, as camera.json and config.yaml say, "
+                f"got {self._record.size}"
+            )
+        self._config = config
+        self._looked = len(self._record.keyframes)
+
+    def __repr__(self) -> str:
+        return f"<SavedMap of {len(self._record.keyframes)} keyframes in {self.path}>"
+
+    @property
+    def timestamps_s(self) -> Array:
+        """(n,) float64 seconds of the keyframes, in the video that they are from."""
+        return np.array([kf.timestamp_s for kf in self._record.keyframes])
+
+    @property
+    def poses(self) -> Array:
+        """(n, 4, 4) float64 world_from_cam of the keyframes."""
+        return np.stack([kf.world_from_cam for kf in self._record.keyframes])
+
+    @property
+    def camera(self) -> Camera | OpenCvLens:
+        """The lens over the photographs."""
+        return self._record.lens
+
+    @cached_property
+    def gaussians(self) -> GaussianArrays | None:
+        """The splat; None where the run had none. Raises InputError where it is damaged."""
+        file = self.path / SPLAT
+        return read_gaussians_ply(file) if is_file(file) else None
+
+    @one_blas_thread()
+    def localise(
+        self, image: Array, *, intrinsics: Sequence[float] = (), near: Place | None = None
+    ) -> Place | Unplaced:
+        """Where an image (h, w, 3) uint8 RGB was taken, or why it has no place in the map.
+
+        intrinsics: its lens, if that is not the map's: the focal length in its pixels, or as ``--intrinsics``.
+        near: the place of the image before it, in a video. Raises InputError for an image of another shape than the
+        map's photographs where no lens is said, ConfigError for a lens that is none.
+        """
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < 16:
+            raise InputError(f"localise: expected an image (h, w, 3) of uint8, got {image.shape} of {image.dtype}")
+        if frame_is_blank(image):
+            return Unplaced("the image is blank")
+        work, moving = self._look(image, tuple(intrinsics))
+        return self.localiser.find(work, moving, near)
+
+    @cached_property
+    def localiser(self) -> Localiser:
+        """The keyframes as a graph, and what finds images in it."""
+        parts = parts_of(self._eye.provider, self._config)
+        graph = graph_of(self._record, self._config, self._eye.camera)
+        described = [(kf.feature_px, kf.descriptors) for kf in self._record.keyframes]
+        if self._record.features == chosen_features(self._config)[0] and hasattr(parts.features, "take_descriptions"):
+            parts.features.take_descriptions([kf.work.gray for kf in graph.keyframes], described)
+        return Localiser(self._config, parts, graph)
+
+    def _look(self, image: Array, intrinsics: tuple[float, ...]) -> tuple[WorkFrame, Array]:
+        """The image as the map's lens at working size would show it, and P(moving): 1 where it shows nothing."""
+        self._looked += 1
+        height, width = image.shape[:2]
+        lens, eye = self._record.lens, self._eye
+        if not intrinsics:
+            if abs(width * lens.height / (height * lens.width) - 1) > SAME_SHAPE:
+                raise InputError(
+                    f"localise: expected images of the map's lens, {lens.width}x{lens.height} or of that shape, got "
+                    f"{width}x{height}; say their lens with --intrinsics"
+                )
+            if (width, height) != (lens.width, lens.height):
+                image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+            work = eye.look(self._looked, 0.0, image)
+            return work, np.zeros(work.gray.shape, np.float32)
+        own = _lens_of_image(intrinsics, (width, height))
+        return self._seen_by_map(image, own)
+
+    def _seen_by_map(self, image: Array, own: OpenCvLens) -> tuple[WorkFrame, Array]:
+        camera = self._eye.camera
+        shrunk = min(1.0, camera.fx_px / own.focal_px)  # so that no pixel is stepped over
+        small = own.resized(max(16, round(own.width * shrunk)), max(16, round(own.height * shrunk)))
+        image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+        at = small.project(camera.rays(camera.pixel_grid()))
+        seen = cv2.remap(image, at.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        inside = ((at >= -0.5) & (at <= np.array([small.width, small.height]) - 0.5)).all(-1)
+        work = self._eye.provider.look(Frame(self._looked, 0.0, seen))
+        return work, np.asarray(~inside, np.float32)
+
+
+def graph_of(record: MapRecord, config: Config, camera: Camera) -> KeyframeGraph:
+    """The keyframes of a map with poses, depths and lens as they are; ``camera`` is that of the working images."""
+    focal = float(np.sqrt(camera.fx_px * camera.fy_px))
+    k, m, n = inverse_radial(focal, (camera.k1, camera.k2, camera.k3), record.size)
+    values = np.array([np.log(focal), k, camera.cx_px, camera.cy_px, m, n])
+    graph = KeyframeGraph(config.graph, as_given(Intrinsics(values, values, np.zeros(6))))
+    graph.size = record.size
+    for index, kf in enumerate(record.keyframes):
+        texture = kf.texture.astype(float)
+        work = WorkFrame(index, kf.timestamp_s, kf.gray, kf.px, record.grid, texture, None, None)
+        moving = kf.moving / 255.0
+        static = np.where(kf.depth_info > 0, static_at(moving, kf.px), 0.0)  # what has no depth says too little
+        graph.add_keyframe(work, static, moving, inverse(kf.world_from_cam), kf.inv_depth, kf.depth_info)
+    graph.started.add(graph.submap)
+    return graph
+
+
+def _lens_of_image(given: tuple[float, ...], size: tuple[int, int]) -> OpenCvLens:
+    if len(given) == 1:
+        given = (given[0], given[0], (size[0] - 1) / 2, (size[1] - 1) / 2)
+    lens = lens_from_intrinsics(given, size)
+    if not size[0] / 50 < lens.focal_px < 50 * size[0]:
+        raise ConfigError(f"--intrinsics: expected a focal length in pixels of {size[0]}x{size[1]}, got {given[0]:g}")
+    return lens
