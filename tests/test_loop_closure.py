@@ -17,6 +17,7 @@ from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import Sim3, procrustes
 from mastd3r.graph.covisibility import overlap, overlaps
+from mastd3r.graph.factors import ReprojectionFactor
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
@@ -96,6 +97,20 @@ def test_drift_goes_to_the_weak_link(scene: Any, turn: Array | None) -> None:
         assert graph.median_inv_depth(k) == pytest.approx(wanted, rel=0.01)
     step = graph.variables[9].cam_from_world @ inverse(graph.variables[8].cam_from_world)
     assert np.linalg.norm(se3_log(step @ inverse(scene.j_from_i(8, 9)))) < 0.01
+
+
+def test_a_lone_loop_is_closed_whatever_holds_the_chain(scene: Any) -> None:
+    """Many edges side by side drift alike: they do not outvote one that closes it."""
+    graph, _ = drifted(scene)
+    p = len(scene.px)
+    for k in range(VIEWS):
+        for i in range(max(0, k - 5), k):
+            graph.edges.append(ReprojectionFactor(i, k, np.zeros((p, 2)), np.ones(p)))
+    i, j = 1, VIEWS - 2
+    before = graph.median_inv_depth(j) / graph.median_inv_depth(i)
+    optimise_pose_graph(graph, [replace(loop_of(scene, i, j, DRIFT), matches=float(p))])
+    after = graph.median_inv_depth(j) / graph.median_inv_depth(i)
+    assert after / before == pytest.approx(DRIFT, rel=0.03)
 
 
 def test_frames_are_stretched_with_their_keyframe(scene: Any) -> None:

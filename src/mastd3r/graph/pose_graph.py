@@ -18,6 +18,7 @@ from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
 ITERATIONS = 15
+LOOP_WEIGHT = 100.0  # of a loop's matches against an edge's: what it says is verified, and many edges hold the chain
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,8 @@ def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
 
     The edges are the pairs that matches connect, with their present relative poses, and the loops. An edge counts by
     the square of its matches, since one that had few was also at the limit of what can be followed: drift goes there.
+    A loop counts ``LOOP_WEIGHT`` times that. Edges side by side drift alike; were each one more measurement against a
+    lone loop, they would keep a part of the drift, and no solver that starts from there takes it out again.
     Scale first, which is linear: minimise the sum of w (x_j - x_i - log s)², x the log of a keyframe's factor. Then the
     poses, with the edges' translations stretched: Gauss-Newton on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
     """
@@ -68,7 +71,7 @@ def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
 def _loop_edge(loop: Loop, row: dict[int, int]) -> _Edge:
     scale = 1 / loop.j_from_i.scale
     rigid = loop.j_from_i.in_lengths(scale).rigid
-    return _Edge(row[loop.i], row[loop.j], rigid, float(np.log(scale)), loop.matches**2, True)
+    return _Edge(row[loop.i], row[loop.j], rigid, float(np.log(scale)), LOOP_WEIGHT * loop.matches**2, True)
 
 
 def _present_edges(graph: KeyframeGraph, row: dict[int, int]) -> list[_Edge]:
