@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,7 @@ def test_thinning_leaves_a_point_a_voxel() -> None:
     assert len(thinned(np.zeros((0, 3)))) == 0
 
 
+@cache
 def room() -> tuple[list[Frame], Truth]:
     views = list(synthetic_frames(31))
     frames = [Frame(v.frame.index, v.frame.timestamp_s, v.frame.image, v.depth_m) for v in views]

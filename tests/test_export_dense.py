@@ -19,7 +19,8 @@ from mastd3r.export.dense_files import write_dense_cloud
 from mastd3r.export.mesh_files import linear, write_mesh
 from mastd3r.export.point_cloud import read_points
 from mastd3r.export.run_folder import RunFolder
-from mastd3r.sources.synthetic import make_room_clip, synthetic_frames
+from mastd3r.sources import synthetic
+from mastd3r.sources.synthetic import SyntheticView, make_room_clip
 from mastd3r.types import StaticCloud, Trajectory
 
 VERTICES = np.array([[0, 0, 1], [1, 0, 2], [0, 2, 3], [1, 1, 1]], np.float32)
@@ -84,9 +85,17 @@ def test_a_glb_is_built_as_the_standard_says(tmp_path: Path) -> None:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder of the room with true poses, and the clip it was made of beside it."""
     home = tmp_path_factory.mktemp("dense")
-    make_room_clip(home / "clip", frames=49)
+    made, view = dict[int, SyntheticView](), synthetic._Clip.view
+
+    def kept(clip: synthetic._Clip, i: int) -> SyntheticView:
+        made[i] = view(clip, i)
+        return made[i]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic._Clip, "view", kept)
+        make_room_clip(home / "clip", frames=49)
+    views = [made[i] for i in range(49)]
     folder = RunFolder(home / "run")
-    views = list(synthetic_frames(49))
     times = np.round([v.frame.timestamp_s for v in views], 6)
     poses = np.stack([v.world_from_cam for v in views])
     states = ("started", *("tracked",) * 48)

@@ -21,7 +21,7 @@ EVERY = 12  # frame of 0.4 s steps: about 0.2 m
 
 @pytest.fixture(scope="module")
 def truth() -> list[SyntheticView]:
-    return [view for n, view in enumerate(synthetic_frames(85)) if n % EVERY == 0]
+    return list(synthetic_frames(85, every=EVERY))
 
 
 def points_of(view: SyntheticView, step: int) -> Array:

@@ -78,6 +78,8 @@ def test_the_walk_is_smooth_and_long_enough() -> None:
 
 def test_the_same_seed_gives_the_same_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "Room", Room)  # a new one every time
+    third = next(v for v in synthetic_frames(3, 160, 120, 3, every=2) if v.frame.index == 2)
+    np.testing.assert_array_equal(third.frame.image, [*synthetic_frames(3, 160, 120, 3)][2].frame.image)
     first, again, other = (next(synthetic_frames(1, 160, 120, seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.frame.image, again.frame.image)
     assert (first.frame.image != other.frame.image).mean() > 0.5

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from ..config import Config
@@ -61,7 +60,7 @@ def _tracking() -> None:
     from ..pipeline import reconstruct
     from ..sources.synthetic import synthetic_frames
 
-    clip = (v.frame for v in synthetic_frames(CLIP_FRAMES * EVERY) if v.frame.index % EVERY == 0)
+    clip = (v.frame for v in synthetic_frames(CLIP_FRAMES * EVERY, every=EVERY))
     config = Config()
     config = replace(config, semantics="none", mapping=replace(config.mapping, enabled=False))
     with tempfile.TemporaryDirectory() as folder:
@@ -70,6 +69,8 @@ def _tracking() -> None:
 
 def _map() -> None:
     """The solver's kernels, then the map's: training, and what is drawn."""
+    import numpy as np
+
     _solver()
     from ..camera.pinhole import Camera
     from ..mapping.mapper import Mapper
@@ -99,6 +100,8 @@ def _map() -> None:
 
 def _solver() -> None:
     """First: tracking wants these soon, and finds them kept by then."""
+    import numpy as np
+
     from ..alignment.reproject import StaticMatches
     from ..graph.bundle_adjustment import solve
     from ..graph.factors import KeyframeVariables, ReprojectionFactor

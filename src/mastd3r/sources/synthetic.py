@@ -65,9 +65,14 @@ class _Clip:
         )
 
 
-def synthetic_frames(frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Iterator[SyntheticView]:
-    """Frames of the room at 30 a second, one after another; the same seed gives the same pixels."""
-    return map(_Clip(width, height, seed).view, range(frames))
+def synthetic_frames(
+    frames: int = 90, width: int = 320, height: int = 240, seed: int = 0, every: int = 1
+) -> Iterator[SyntheticView]:
+    """Frames of the room at 30 a second, one after another, or ``every`` such one of them.
+
+    The same seed gives the same pixels.
+    """
+    return map(_Clip(width, height, seed).view, range(0, frames, every))
 
 
 def make_room_clip(folder: Path, frames: int = 90, width: int = 320, height: int = 240, seed: int = 0) -> Path:
