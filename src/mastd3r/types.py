@@ -18,6 +18,7 @@ from .camera.pinhole import Camera
 
 Array = NDArray[Any]
 State = Literal["started", "tracked", "interpolated", "lost"]
+MEASURED: tuple[State, ...] = ("started", "tracked")  # states whose pose was seen, not guessed
 USABLE_WEIGHT = 0.05  # a match, or a pixel that may be matched, that weighs less says nothing
 
 
@@ -186,7 +187,7 @@ class Trajectory:
 
     def tracked(self) -> Trajectory:
         """The rows whose pose was seen, not interpolated."""
-        return self.rows(np.flatnonzero([s in ("started", "tracked") for s in self.states]))
+        return self.rows(np.flatnonzero([s in MEASURED for s in self.states]))
 
     def rows(self, keep: Array) -> Trajectory:
         """The rows with these indices (m,)."""

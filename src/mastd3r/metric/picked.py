@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .estimate import Scale, scale_of
+from .estimate import Scale, scale_of, tukey
 from .material import Material
 from .spec import Asked
 
@@ -84,7 +84,7 @@ def _fit(px: Array, inv_depth: Array, at: Array, reach_px: float, where: str) ->
         x = np.linalg.solve(normal, design.T @ (weight * value))
         residual = value - design @ x
         sigma = 1.4826 * float(np.median(np.abs(residual[weight > 0]))) + 1e-6 * float(np.median(value))
-        weight = base * np.maximum(1 - (residual / (4.685 * sigma)) ** 2, 0) ** 2
+        weight = base * tukey(residual / sigma)
     used = int((weight > 0).sum())
     if x[0] <= 0 or used < LEAST:
         raise InputError(f"{where}: expected one surface around {at[0]:g},{at[1]:g}, got an edge; pick beside it")

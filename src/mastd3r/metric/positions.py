@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..geometry.sim3 import Sim3, procrustes
 from ..reading.files import short, whole_text
-from ..types import Trajectory
+from ..types import MEASURED, Trajectory
 from .estimate import Scale, jackknifed, scale_of, tukey
 from .material import Material
 
@@ -107,7 +107,7 @@ def paired(known: Positions, trajectory: Trajectory) -> tuple[Array, Array]:
 
     Between two tracked frames that follow one another the camera moves evenly.
     """
-    tracked = np.array([s in ("started", "tracked") for s in trajectory.states], bool)
+    tracked = np.array([s in MEASURED for s in trajectory.states], bool)
     times, places = trajectory.timestamps_s, trajectory.world_from_cam[:, :3, 3]
     if not tracked.any():
         return np.zeros((0, 3)), np.zeros((0, 3))

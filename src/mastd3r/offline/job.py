@@ -36,7 +36,7 @@ from ..mapping.rasterise import accelerator
 from ..progress import Reporter
 from ..tracking.depth_prior import own_depth_spread
 from ..tracking.memory import TrackingMemory
-from ..types import Frame
+from ..types import MEASURED, Frame
 from .checkpoints import Checkpoints, JobMemory, Stage
 from .dense import write_dense_cloud_of
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
@@ -356,7 +356,7 @@ class RunJob:
         )
         if lost:
             self.folder.note(f"{len(lost)} frames were lost; their poses are interpolated")
-        if 2 * sum(f.state in ("tracked", "started") for f in self._final) < len(self._final):
+        if 2 * sum(f.state in MEASURED for f in self._final) < len(self._final):
             few = f"fewer than half of the {len(self._final)} frames were tracked: most of the trajectory is a guess"
             self.folder.note(few)
             log.warning(few)

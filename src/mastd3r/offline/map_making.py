@@ -136,8 +136,7 @@ class _PointsOfKeyframes:
         rows, cols = work.grid
         mine = np.flatnonzero(self.kf == n)
         points = transform(self.cam_from_world[n], self.world[self.point[mine]])
-        cell_px = min(self.eye.provider.width // cols, self.eye.provider.height // rows)
-        at = np.floor((self.px[mine] + 0.5) / cell_px).astype(int)
+        at = np.floor((self.px[mine] + 0.5) / self.eye.provider.cell_px).astype(int)
         good = (points[:, 2] > 0) & (at >= 0).all(1) & (at < [cols, rows]).all(1)
         mine, points, at = mine[good], points[good], at[good]
         cell = at[:, 1] * cols + at[:, 0]

@@ -19,7 +19,7 @@ from ..evaluation.mask_error import read_mask
 from ..export.run_folder import stamp
 from ..mapping.placing import placed
 from ..mapping.splat import Splat
-from ..types import Frame
+from ..types import MEASURED, Frame
 from .final_solve import FinalFrame
 from .smoothing import view_static
 
@@ -59,7 +59,7 @@ def place_frames(
         n = place.get(frame.index)
         if n is None:
             continue
-        if final[n].state in ("tracked", "started") and np.isfinite(final[n].world_from_cam).all():
+        if final[n].state in MEASURED and np.isfinite(final[n].world_from_cam).all():
             tried += 1
             found = _placed(frame, view, splat, start(final[n]), masks)
             if found is not None:

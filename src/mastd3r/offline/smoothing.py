@@ -26,7 +26,7 @@ from ..parts import Parts
 from ..sources.rectified import rectified
 from ..tracking.mask_input import dynamics_input
 from ..tracking.observation import Observer
-from ..types import Frame, View, WorkFrame
+from ..types import MEASURED, Frame, View, WorkFrame
 from .final_solve import FinalFrame
 from .point_votes import PointVotes
 from .reweighting import MaskReweighting
@@ -166,7 +166,7 @@ def _inputs(
         if position in chosen:
             photograph = map_view.pinhole_image(frame.as_taken.image)
             uncertainty = _uncertainty(place, graph, given, flow, map_view.tau_px)
-        given = replace(given, color=small, pose_known=place.state in ("tracked", "started"))
+        given = replace(given, color=small, pose_known=place.state in MEASURED)
         given = given if parts.provider.own_scale_known else _at_expected_scale(given)
         yield given, _Waiting(position, place, small, photograph, uncertainty)
 
@@ -183,7 +183,7 @@ def _at_expected_scale(given: DynamicsInput) -> DynamicsInput:
 
 def view_positions(final: list[FinalFrame], config: Config) -> set[int]:
     """Positions of the training views: keyframes first, then evenly; never holdout, never a guessed pose."""
-    usable = [n for n, f in enumerate(final) if not is_holdout(n) and f.state in ("tracked", "started")]
+    usable = [n for n, f in enumerate(final) if not is_holdout(n) and f.state in MEASURED]
     most = config.mapping.max_views if config.mapping.enabled else 0
     if len(usable) <= most:
         return set(usable)

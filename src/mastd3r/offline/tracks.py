@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..export.tracks import Tracks
 from ..geometry.se3 import inverse, transform
 from ..graph.keyframe_graph import KeyframeGraph
-from ..types import USABLE_WEIGHT
+from ..types import MEASURED, USABLE_WEIGHT
 from .final_solve import FinalFrame
 from .static_cloud import placed_points
 
@@ -32,7 +32,7 @@ def static_tracks(
     ``colors`` (p, 3) uint8 and ``moving`` (p,) P(moving) of each keyframe's px; ``photograph_px`` brings (m, 2) pixels
     at working size into the photograph. Points with a depth of their own that two frames or more see.
     """
-    rows = [n for n, f in enumerate(final) if f.state in ("started", "tracked")]
+    rows = [n for n, f in enumerate(final) if f.state in MEASURED]
     row_of_kf = {final[n].record.kf_id: k for k, n in enumerate(rows) if final[n].record.is_keyframe}
     points, found_colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     seen = [(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))]

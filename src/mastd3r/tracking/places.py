@@ -13,7 +13,7 @@ from ..geometry.se3 import inverse, so3_log
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..parts import Parts
-from ..types import WorkFrame
+from ..types import MEASURED, WorkFrame
 from .two_view import TwoView, TwoViewEstimator
 
 Array = NDArray[Any]
@@ -59,7 +59,7 @@ def plausible_turn(graph: KeyframeGraph, index: int, view: TwoView) -> bool:
     submap = graph.submap_of[view.anchor.id]
     if submap not in graph.started:
         return True
-    tracked = [r for r in graph.records if r.state in ("tracked", "started") and r.index != index]
+    tracked = [r for r in graph.records if r.state in MEASURED and r.index != index]
     tracked = [r for r in tracked if graph.submap_of[r.kf_id] == submap]
     if not tracked:
         return False
