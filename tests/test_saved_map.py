@@ -24,6 +24,8 @@ from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.run_folder import RunFolder
 from mastd3r.export.tracks import Tracks
 from mastd3r.geometry.se3 import inverse, so3_log, transform
+from mastd3r.mapping.gaussian_arrays import GaussianArrays
+from mastd3r.mapping.ply import write_gaussians_ply
 from mastd3r.sources import synthetic
 from mastd3r.tracking.localisation import Place, Unplaced
 from mastd3r.types import State, Trajectory
@@ -129,6 +131,36 @@ def test_information_of_depths_is_what_the_other_keyframes_measure(saved: mastd3
         ends = [transform(between, LENS.rays(v.px[row]) / (v.inv_depth[row] + s)) for s in (-1e-5, 1e-5)]
         total += float((((LENS.project(ends[1]) - LENS.project(ends[0])) / 2e-5) ** 2).sum())
     assert info[row] == pytest.approx(total, rel=0.02)
+
+
+def test_a_map_is_in_metres_where_the_run_knows_them(
+    run: Path, saved: mastd3r.SavedMap, views: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Poses, depths and splat, measured after the run by ``mastd3r scale``; and so is what is found in it."""
+    measured = shutil.copytree(run, tmp_path / "run")
+    none = np.zeros((1, 0, 3), np.float32)
+    one = np.ones(1, np.float32)
+    means, turned = np.array([[1, 2, 3]], np.float32), np.array([[1, 0, 0, 0]], np.float32)
+    splat = GaussianArrays(means, 0.1 * means, turned, 0.5 * one, 0.1 * means, np.zeros(1, np.int32), none)
+    write_gaussians_ply(measured / "gaussians.ply", splat)
+    assert main(["scale", str(measured), "factor=2"]) == 0
+    metric = mastd3r.save_map(measured, tmp_path / "map")
+    assert (saved.unit, metric.unit) == ("map units", "m")
+    np.testing.assert_allclose(metric.poses[:, :3, 3], 2 * saved.poses[:, :3, 3], atol=1e-6)
+    for n in range(len(KEYFRAMES)):
+        mine, theirs = (m.localiser.graph.variables[n].inv_depth for m in (metric, saved))
+        np.testing.assert_allclose(mine, theirs / 2, rtol=1e-5)
+    assert metric.gaussians is not None
+    np.testing.assert_allclose(metric.gaussians.means, 2 * means)
+    np.testing.assert_allclose(metric.gaussians.scales, 0.2 * means, rtol=1e-5)
+    found = metric.localise(views[QUERY].frame.image)
+    assert isinstance(found, Place)
+    assert np.linalg.norm(found.world_from_cam[:3, 3] - 2 * views[QUERY].world_from_cam[:3, 3]) < 0.04
+    image = tmp_path / "2.png"
+    cv2.imwrite(str(image), views[QUERY].frame.image[..., ::-1])
+    assert main(["localise", str(tmp_path / "map"), str(image), "--out", str(tmp_path / "found")]) == 0
+    said = json.loads((tmp_path / "found" / "localised.json").read_text())
+    assert said["unit"] == "m" and " m and " in capsys.readouterr().out.replace("\n", " ")
 
 
 def test_an_image_is_found_where_it_was_taken(saved: mastd3r.SavedMap, views: Any) -> None:
@@ -250,6 +282,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "version": (_edit(version=2), "expected version 1 of a saved map, got 2"),
     "not ours": (_edit(made_by="another"), "expected a map of mastd3r save, got one of 'another'"),
     "size": (_edit(size=[160]), "size: expected two whole numbers"),
+    "unit": (_edit(unit="feet"), "unit: expected m or map units, got 'feet'"),
     "no keyframes": (_edit(keyframes=[]), "keyframes: expected a list of 1 to"),
     "pose": (_edit(keyframes=[{"timestamp_s": 0, "world_from_cam": [[2] * 4] * 4}]), "expected a rotation"),
     "gone": (lambda f: (f / "keyframes" / "000002.npz").unlink(), "000002.npz: expected a keyframe of a saved map"),

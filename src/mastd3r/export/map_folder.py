@@ -5,8 +5,7 @@ from __future__ import annotations
 import io
 import math
 import os
-import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from ..reading.files import is_file, short, whole_json, whole_text
 from ..reading.pictures import MOST_PIXELS
 from ..reading.yaml_text import MOST_YAML_BYTES
 from .export_folder import FolderKind, export_folder
-from .files import write_bytes, write_json, writing
+from .files import write_bytes, write_json
 from .run_record import checked_camera, number, text
 
 Array = NDArray[Any]
@@ -30,6 +29,7 @@ MAP = FolderKind("map.json", "mastd3r save", "an earlier map")
 VERSION = 1
 KEYFRAMES, LENS, CONFIG, SPLAT = "keyframes", "camera.json", "config.yaml", "gaussians.ply"
 MOST_KEYFRAMES = 100_000
+UNITS = ("m", "map units")
 LENGTH_OFF = 1e-6  # largest entry of R^T R - 1 of a pose
 
 
@@ -60,6 +60,7 @@ class MapRecord:
     config: str  # YAML, options of the run
     keyframes: tuple[MapKeyframe, ...]
     source: str = ""  # the run that it was saved from
+    unit: str = UNITS[1]  # of all lengths, one of UNITS
 
 
 ARRAYS = {  # type, shape
@@ -74,10 +75,11 @@ ARRAYS = {  # type, shape
 }
 
 
-def write_map(out: Path, record: MapRecord, splat: Path | None, inputs: Sequence[Path]) -> None:
+def write_map(out: Path, record: MapRecord, write_splat: Callable[[Path], None] | None, inputs: Sequence[Path]) -> None:
     """Write a map to the folder ``out``, whole or not at all; an earlier map there is replaced.
 
-    ``splat``: a gaussians.ply to copy. ``inputs``: what was read. Raises OutputError as ``export_folder`` does.
+    ``write_splat`` writes gaussians.ply, in the unit of the map. ``inputs``: what was read.
+    Raises OutputError as ``export_folder`` does.
     """
     facts = {
         "version": VERSION,
@@ -85,6 +87,7 @@ def write_map(out: Path, record: MapRecord, splat: Path | None, inputs: Sequence
         "grid": record.grid,
         "features": record.features,
         "source": record.source,
+        "unit": record.unit,
         "keyframes": [
             {"timestamp_s": kf.timestamp_s, "world_from_cam": kf.world_from_cam.tolist()} for kf in record.keyframes
         ],
@@ -101,9 +104,8 @@ def write_map(out: Path, record: MapRecord, splat: Path | None, inputs: Sequence
         own = {f.name: getattr(camera, f.name) for f in fields(camera)}
         write_json(staged / LENS, {**own, "distortion": list(terms)})
         write_bytes(staged / CONFIG, record.config.encode())
-        if splat is not None:
-            with writing(out):
-                shutil.copyfile(splat, staged / SPLAT)
+        if write_splat is not None:
+            write_splat(staged / SPLAT)
 
 
 def read_map(folder: Path) -> MapRecord:
@@ -123,6 +125,9 @@ def read_map(folder: Path) -> MapRecord:
     for key in ("features", "source"):
         if not text(facts.get(key)):
             raise InputError(f"{path} {key}: expected text, got {short(repr(facts[key]))}")
+    unit = facts.get("unit", UNITS[1])
+    if unit not in UNITS:
+        raise InputError(f"{path} unit: expected {' or '.join(UNITS)}, got {short(repr(unit))}")
     rows = facts.get("keyframes")
     if not isinstance(rows, list) or not 0 < len(rows) <= MOST_KEYFRAMES:
         raise InputError(f"{path} keyframes: expected a list of 1 to {MOST_KEYFRAMES}, got {short(repr(rows))}")
@@ -134,6 +139,7 @@ def read_map(folder: Path) -> MapRecord:
         whole_text(folder / CONFIG, "readable YAML", most=MOST_YAML_BYTES),
         tuple(_keyframe(folder, n, row, size, grid) for n, row in enumerate(rows)),
         facts.get("source") or "",
+        unit,
     )
 
 

@@ -16,7 +16,7 @@ class GaussianArrays:
     """The map for export, in plain numbers."""
 
     means: Array  # (n, 3) float32, world
-    scales: Array  # (n, 3) float32, standard deviations in map units
+    scales: Array  # (n, 3) float32, standard deviations, in the unit of means
     quats: Array  # (n, 4) float32 wxyz, unit length
     opacities: Array  # (n,) float32 0..1
     colors: Array  # (n, 3) float32 RGB, 0..1

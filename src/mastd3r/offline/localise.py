@@ -37,6 +37,7 @@ class Located:
     name: str
     timestamp_s: float
     place: Place | Unplaced
+    unit: str  # of the map
 
     @property
     def said(self) -> str:
@@ -45,7 +46,7 @@ class Located:
             return f"not found: {self.place.reason}"
         x, y, z = self.place.world_from_cam[:3, 3]
         sigma, turn = self.place.position_sigma, self.place.rotation_sigma_deg
-        return f"found at {x:.4f} {y:.4f} {z:.4f}, to {sigma:.4f} map units and {turn:.2f} deg (1 sigma)"
+        return f"found at {x:.4f} {y:.4f} {z:.4f}, to {sigma:.4f} {self.unit} and {turn:.2f} deg (1 sigma)"
 
     def facts(self) -> dict[str, Any]:
         """For localised.json."""
@@ -80,7 +81,12 @@ def localise_source(
     images each is looked for from the place of the one before, too. Raises InputError, ConfigError, OutputError;
     nothing half-written stays.
     """
-    facts: dict[str, Any] = {"map": str(saved.path.resolve()), "source": str(path.resolve()), "images": []}
+    facts: dict[str, Any] = {
+        "map": str(saved.path.resolve()),
+        "source": str(path.resolve()),
+        "unit": saved.unit,
+        "images": [],
+    }
     with export_folder(out, facts, [saved.path, path], LOCALISED) as staged:
         located = []
         frames, length = _frames(path, window)
@@ -89,7 +95,7 @@ def localise_source(
             for name, frame in frames:
                 place = saved.localise(frame.image, intrinsics=intrinsics, near=before)
                 before = place if isinstance(place, Place) else None
-                located.append(Located(name, frame.timestamp_s, place))
+                located.append(Located(name, frame.timestamp_s, place, saved.unit))
                 bar.advance()
         if not located:
             raise InputError(f"{path}: expected images, got none")

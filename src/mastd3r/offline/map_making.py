@@ -19,31 +19,33 @@ from ..errors import InputError
 from ..export.map_folder import MapKeyframe, MapRecord, write_map
 from ..export.read_run import Run
 from ..export.run_folder import stamp
-from ..export.tracks import Tracks, read_tracks
+from ..export.tracks import Tracks
 from ..geometry.se3 import inverse, transform
+from ..mapping.ply import write_gaussians_ply
 from ..parts import chosen_features, parts_of
 from ..pointmap.geometric import GeometricPointmaps, working_size
 from ..types import Frame, Source, Trajectory, WorkFrame
 from .photographs import check_size
-from .renders import lens_of
+from .renders import gaussians_of, lens_of
 
 Array = NDArray[Any]
 STEP = 1e-3  # relative, of an inverse depth: over it a projection is taken to be straight
 
 
 def save_run_as_map(run: Run, source: Source, source_path: Path, config: Config, out: Path) -> None:
-    """Write the map of a run to the folder ``out``. ``source``: its photographs, from ``source_path``.
+    """Write the map of a run to the folder ``out``, in ``run.unit``. ``source``: its photographs, from ``source_path``.
 
     Raises InputError for a run without keyframes, lens and tracks, and a source that is not the run's; OutputError.
     """
     record = map_of(run, source, config)
-    splat = run.path / "gaussians.ply"
-    write_map(out, record, splat if os.path.lexists(splat) else None, [run.path, source_path])
+    splat = gaussians_of(run) if os.path.lexists(run.path / "gaussians.ply") else None
+    write_splat = None if splat is None else lambda path: write_gaussians_ply(path, splat)
+    write_map(out, record, write_splat, [run.path, source_path])
 
 
 def map_of(run: Run, source: Source, config: Config) -> MapRecord:
     """The same as a value."""
-    lens, tracks = lens_of(run), read_tracks(run.path / "tracks.npz")
+    lens, tracks = lens_of(run), run.tracks()
     check_size(run, source, lens)
     keyframes = run.trajectory.tracked().keyframes()  # poses that were guessed are no map
     if len(keyframes.timestamps_s) < 2 or not len(tracks.point):
@@ -58,7 +60,8 @@ def map_of(run: Run, source: Source, config: Config) -> MapRecord:
     ]
     name, described = _described(config, eye, works)
     made = [replace(kf, feature_px=d[0], descriptors=d[1]) for kf, d in zip(made, described, strict=True)]
-    return MapRecord(eye.provider.size, works[0].grid, lens, name, run.config, tuple(made), str(run.path.resolve()))
+    size, grid = eye.provider.size, works[0].grid
+    return MapRecord(size, grid, lens, name, run.config, tuple(made), str(run.path.resolve()), run.unit)
 
 
 class WorkingEye:

@@ -277,7 +277,7 @@ class Reconstruction:
         """See ``pipeline.save_map``."""
         path = self._photographs(source)
         opened = open_source(path, self.config.source, want_semantic=False)
-        save_run_as_map(self._run, opened, path, self.config, out)
+        save_run_as_map(self._run.in_metres(), opened, path, self.config, out)
 
     @one_blas_thread()
     def export(

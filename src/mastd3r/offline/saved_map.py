@@ -35,7 +35,7 @@ SAME_SHAPE = 0.01  # by which width / height of an image may differ from that of
 
 
 class SavedMap:
-    """A map of one world: keyframes, their points and poses, the lens, perhaps a splat. Lengths are map units."""
+    """A map of one world: keyframes, their points and poses, the lens, perhaps a splat. Lengths are in ``unit``."""
 
     def __init__(self, path: Path) -> None:
         """``path``: its folder. Raises InputError, ConfigError for one that is none, or is damaged."""
@@ -62,6 +62,11 @@ class SavedMap:
     def poses(self) -> Array:
         """(n, 4, 4) float64 world_from_cam of the keyframes."""
         return np.stack([kf.world_from_cam for kf in self._record.keyframes])
+
+    @property
+    def unit(self) -> str:
+        """Of all lengths: m where the run knew metres, else map units."""
+        return self._record.unit
 
     @property
     def camera(self) -> Camera | OpenCvLens:

@@ -39,7 +39,7 @@ NOISE = 20.0  # errors of matches are alike within a view: so many times one mat
 
 @dataclass(frozen=True)
 class Place:
-    """Where an image was taken, in the map's frame and units."""
+    """Where an image was taken, in the map's frame and unit."""
 
     world_from_cam: Array  # (4, 4)
     covariance: Array  # (6, 6) of a small motion of the camera: its translation in its own axes, then its rotation, rad
@@ -50,7 +50,7 @@ class Place:
 
     @property
     def position_sigma(self) -> float:
-        """1 sigma of the position, map units, all axes together."""
+        """1 sigma of the position, in the map's unit, all axes together."""
         return float(np.sqrt(np.trace(self.covariance[:3, :3])))
 
     @property
