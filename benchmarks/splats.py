@@ -15,14 +15,17 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mastd3r.cli.commands import DEMO_GAUSSIANS, DEMO_STEPS
 from mastd3r.config import Config
 from mastd3r.export.machine import machine_info
 from mastd3r.export.read_run import read_run
 from mastd3r.sources.synthetic import make_room_clip
 
+# as ``mastd3r demo`` does
+DEMO = ["--set", f"mapping.iterations={DEMO_STEPS}", "--set", f"mapping.max_gaussians={DEMO_GAUSSIANS}"]
 # name -> (sequence, options of run, width that the checker draws, clean sequence)
 ENTRIES: dict[str, tuple[str, list[str], int, str | None]] = {
-    "demo": ("demo", ["--set", "mapping.iterations=1200", "--set", "mapping.max_gaussians=30000"], 320, None),
+    "demo": ("demo", DEMO, 320, None),
     "kitchen": ("kitchen", [], 640, None),
     "kitchen, draft": ("kitchen", ["--quality", "draft"], 320, None),
     "kitchen_walk": ("kitchen_walk", [], 640, "kitchen"),
