@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
+from mastd3r.geometry.least_squares import damped_solve
 from mastd3r.geometry.reprojection_kernels import N_GLOBAL, edge_residuals
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import procrustes
+from mastd3r.graph import bundle_adjustment
 from mastd3r.graph.bundle_adjustment import solve
 from mastd3r.graph.factors import KeyframeVariables, ReprojectionFactor, Variables
 from mastd3r.graph.intrinsics import Intrinsics
@@ -103,6 +106,46 @@ def test_unknown_lens_and_noise(exact_scene: Callable[..., Any], focal_error: fl
     check(scene, variables, 0.01, 0.005, 0.02)
     assert report.converged and report.cost_last < 0.05 * report.cost_first
     assert 0 < report.focal_sigma_ratio < 0.05
+
+
+@pytest.mark.parametrize("held", [(2, 3, 4, 5), ()])
+def test_sparse_equations_are_the_dense_ones(
+    exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, held: tuple[int, ...]
+) -> None:
+    """The system of a long video, block by block and with parts made twice: the same steps, costs and sigma."""
+    scene = exact_scene(VIEWS, step=0.2, k=-0.06, cell_px=12)
+    ends = []
+    for dense_most in (300, 0):
+        monkeypatch.setattr(bundle_adjustment, "DENSE_MOST", dense_most)
+        monkeypatch.setattr(bundle_adjustment, "AT_ONCE", 2 if dense_most == 0 else 64)
+        variables, lens = blocks_of(scene), whole_lens(scene)
+        lens.prior_info[list(held)] = np.inf
+        edges = [e for e in edges_of(scene, 0.2) if abs(e.i - e.j) < 3]  # some blocks are empty
+        report = solve(variables, edges, lens, fixed=frozenset([0]), iterations=6)
+        ends.append((report, variables, lens.values))
+    (dense, there, lens_there), (sparse, again, lens_again) = ends
+    assert sparse.iterations == dense.iterations
+    assert sparse.cost_last == pytest.approx(dense.cost_last, rel=1e-7)
+    assert sparse.focal_sigma_ratio == pytest.approx(dense.focal_sigma_ratio, rel=1e-4)
+    assert lens_again == pytest.approx(lens_there, rel=1e-5, abs=1e-6)
+    for k in range(VIEWS):
+        assert again[k].cam_from_world == pytest.approx(there[k].cam_from_world, abs=1e-5)
+        assert again[k].inv_depth == pytest.approx(there[k].inv_depth, rel=1e-4)
+
+
+def test_a_sparse_system_that_is_not_positive_is_refused() -> None:
+    """As a dense one: by Cholesky there, by the signs of the pivots here; empty rows stay where they are."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(8, 8))
+    good, rhs = root @ root.T, rng.normal(size=8)
+    good[5], good[:, 5] = 0.0, 0.0
+    bad = good.copy()
+    bad[2, 3] = bad[3, 2] = 100.0
+    for hess in (good, csc_array(good)):
+        step = damped_solve(hess, rhs, 1e-3)
+        assert step is not None and step[5] == 0
+        assert step == pytest.approx(damped_solve(good, rhs, 1e-3), rel=1e-9)
+    assert damped_solve(bad, rhs, 1e-3) is None and damped_solve(csc_array(bad), rhs, 1e-3) is None
 
 
 def test_all_six_unknowns_of_the_lens_come_back(exact_scene: Callable[..., Any]) -> None:

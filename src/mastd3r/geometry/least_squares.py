@@ -8,17 +8,21 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
+from scipy.sparse import diags_array, issparse
+from scipy.sparse.linalg import splu
 
 Array = NDArray[Any]
 FALL, GROWTH = 0.2, 10.0  # of the damping, after a step that is taken and one that is refused
 NOISE = 1e-9  # relative rise of the cost that is rounding
 
 
-def damped_solve(hess: Array, rhs: Array, damping: float) -> Array | None:
-    """Solve (H + damping diag H) x = b for symmetric H (n, n); None where it is not positive definite.
+def damped_solve(hess: Any, rhs: Array, damping: float) -> Array | None:
+    """Solve (H + damping diag H) x = b for symmetric H (n, n), dense or sparse; None where not positive definite.
 
     Unknowns with an empty row (no observation, or fixed) get a zero step.
     """
+    if issparse(hess):
+        return _sparse_step(hess, rhs, damping)
     diagonal = np.diag(hess)
     used = diagonal > 0
     step = np.zeros_like(rhs)
@@ -30,11 +34,23 @@ def damped_solve(hess: Array, rhs: Array, damping: float) -> Array | None:
     return None if fault or not np.isfinite(step).all() else step
 
 
+def _sparse_step(hess: Any, rhs: Array, damping: float) -> Array | None:
+    diagonal = hess.diagonal()
+    used = diagonal > 0
+    system = hess + diags_array(np.where(used, damping * diagonal + 1e-8, 1.0))
+    try:  # no pivoting: of a positive definite matrix none is needed, and U shows whether it is one
+        factor = splu(system.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:  # exactly singular
+        return None
+    step = np.where(used, factor.solve(rhs), 0.0)
+    return step if (factor.U.diagonal() > 0).all() and np.isfinite(step).all() else None
+
+
 class Estimate(Protocol):
     """Values of all unknowns. It does not change: ``moved`` makes another one."""
 
-    def linearised(self) -> tuple[Array, Array, float]:
-        """Normal equations H (n, n), b (n,) of a step, and the cost."""
+    def linearised(self) -> tuple[Any, Array, float]:
+        """Normal equations H (n, n), dense or sparse, b (n,) of a step, and the cost."""
         ...
 
     def cost(self) -> float:
@@ -68,7 +84,7 @@ class Minimum(Generic[E]):
     converged: bool
     cost_first: float  # -1 without iterations
     cost_last: float
-    hess: Array | None  # (n, n) of the last step that was taken; None: none was
+    hess: Any  # (n, n) of the last step that was taken; None: none was
 
 
 def levenberg_marquardt(start: E, damping: Damping, *, iterations: int, tolerance: float) -> Minimum[E]:

@@ -23,6 +23,7 @@ _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy",
 N_GLOBAL = 6
 N_POSE = 6
 N_COLS = N_POSE + N_GLOBAL
+CONVERGED = 1e-8  # step of a radius on the unit plane, after which Newton is exact to rounding
 MIN_DEPTH = 0.02  # Y_z below this share of the anchor's depth: the point is (nearly) behind the camera
 
 
@@ -63,8 +64,10 @@ def _distort(
     for _ in range(8):
         r2 = r * r
         slope = 1.0 + r2 * (3.0 * k + r2 * (5.0 * m + 7.0 * n * r2))
-        r -= (r * (1.0 + r2 * (k + r2 * (m + n * r2))) - ru) / slope
-        r = min(max(r, 0.0), fold_r)
+        step = (r * (1.0 + r2 * (k + r2 * (m + n * r2))) - ru) / slope
+        r = min(max(r - step, 0.0), fold_r)
+        if abs(step) < CONVERGED:
+            break
     s = r / ru
     return qx * s, qy * s, r * r
 
@@ -186,6 +189,27 @@ def _edge_point(
     return rx, ry, jd0, jd1, yz
 
 
+@nb.njit(inline="always", **_JIT)
+def _edge_residual(
+    px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, f: float, fold: tuple[float, float]
+) -> tuple[float, float, float]:
+    """What ``_edge_point`` says without Jacobians: (rx, ry) and Y_z; ``f`` is exp(g[0])."""
+    k = g[1]
+    m = g[4]
+    n = g[5]
+    ux, uy, _ = _undistort(px - g[2], py - g[3], f, k, m, n)
+    yx = t[0, 0] * ux + t[0, 1] * uy + t[0, 2] + t[0, 3] * d
+    yy = t[1, 0] * ux + t[1, 1] * uy + t[1, 2] + t[1, 3] * d
+    yz = t[2, 0] * ux + t[2, 1] * uy + t[2, 2] + t[2, 3] * d
+    if yz < MIN_DEPTH:
+        return 0.0, 0.0, yz
+    iz = 1.0 / yz
+    vx, vy, s2 = _distort(yx * iz, yy * iz, k, m, n, fold[0], fold[1])
+    if s2 < 0.0:
+        return 0.0, 0.0, 0.0
+    return tx - g[2] - f * vx, ty - g[3] - f * vy, yz
+
+
 @nb.njit(**_JIT)
 def anchor_system(
     px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
@@ -263,16 +287,15 @@ def anchor_cost(
 ) -> Array:
     """The robust cost (m,) of ``anchor_system`` alone, for accepting or refusing a step."""
     m, p = weight.shape
-    fold = fold_radius(g[1], g[4], g[5])
+    f, fold = math.exp(g[0]), fold_radius(g[1], g[4], g[5])
     cost = np.zeros(m)
     c2 = kernel_px * kernel_px
     for e in range(m):
-        jac = np.zeros((2, N_COLS))
         for n in range(p):
             if weight[e, n] <= 0.0:
                 continue
-            rx, ry, _, _, yz = _edge_point(
-                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, fold, jac
+            rx, ry, yz = _edge_residual(
+                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, f, fold
             )
             if yz < MIN_DEPTH:
                 cost[e] += weight[e, n] * c2 * 4.0
@@ -285,12 +308,11 @@ def anchor_cost(
 def edge_residuals(px: Array, depth: Array, target: Array, j_from_i: Array, g: Array) -> tuple[Array, Array]:
     """Residuals (p, 2) in pixels and Y_z (p,) of one edge (1000 px where the point is behind j)."""
     p = px.shape[0]
-    fold = fold_radius(g[1], g[4], g[5])
+    f, fold = math.exp(g[0]), fold_radius(g[1], g[4], g[5])
     out = np.empty((p, 2))
     z = np.empty(p)
     for n in range(p):
-        jac = np.empty((2, N_COLS))
-        rx, ry, _, _, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, fold, jac)
+        rx, ry, yz = _edge_residual(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, f, fold)
         z[n] = yz
         out[n, 0] = rx if yz >= MIN_DEPTH else 1e3
         out[n, 1] = ry if yz >= MIN_DEPTH else 1e3

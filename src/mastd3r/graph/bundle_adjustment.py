@@ -1,12 +1,12 @@
 """Joint optimisation of keyframe poses, inverse depths and intrinsics from flow matches (docs/joint_optimisation.md).
 
-Levenberg-Marquardt; depths are eliminated by the Schur complement, one anchor keyframe after another, so the dense
-system that is solved has 6 rows a keyframe and 6 for the intrinsics.
+Levenberg-Marquardt; depths are eliminated by the Schur complement, one anchor keyframe after another, so the system
+that is solved has 6 rows a keyframe and 6 for the intrinsics: dense, or of a long video sparse (normal_equations.py).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,10 +19,12 @@ from ..geometry.reprojection_kernels import N_COLS, N_GLOBAL, anchor_columns, an
 from ..geometry.se3 import adjoint, inverse, se3_exp
 from .factors import Factors, ReprojectionFactor, Variables
 from .intrinsics import Intrinsics
+from .normal_equations import DENSE_MOST, BlockPattern, DenseEquations, SparseEquations, unknowns
 
 Array = NDArray[Any]
 AT_INFINITY = 1e-6  # of an anchor's typical inverse depth: that of a point beyond infinity once all is solved
 STEP_AT_INFINITY = 0.1  # of the same: as far as one step moves a point there, on either side
+AT_ONCE = 64  # anchor keyframes whose parts of the system are held together
 DAMPING = Damping(least=1e-7, most=0.0, tries=6)  # a cost is cheap beside a system: one system serves six tries
 
 
@@ -77,8 +79,8 @@ def solve(
 class _AnchorTerm:
     """What one anchor keyframe contributes in one iteration, kept for the back-substitution."""
 
-    columns: Array  # global column of each local column, -1 = fixed
-    cross: Array  # (p, n) E
+    blocks: Array  # block of each six local columns, -1 = fixed
+    cross: Array | None  # (p, n) E; None where it is made once more when it is needed
     hdd: Array
     bd: Array
     depth_info: Array  # (p,) hdd without the prior
@@ -99,8 +101,23 @@ class _Problem:
         self.by_anchor: Factors = {}
         for edge in edges:
             self.by_anchor.setdefault(edge.i, []).append(edge)
-        self.row_of = {k: 6 * n for n, k in enumerate(k for k in variables if k not in fixed)}
+        self.block_of = {k: n for n, k in enumerate(k for k in variables if k not in fixed)}
+        self.lens = len(self.block_of)  # the last block
         self.terms: dict[int, _AnchorTerm] = {}
+        self.pattern: BlockPattern | None = None
+        if self.lens >= DENSE_MOST:
+            groups = [self.blocks_of(i) for i in self.by_anchor]
+            self.pattern = BlockPattern(self.lens + 1, [g[g >= 0] for g in groups])
+
+    def blocks_of(self, i: int) -> Array:
+        """(m + 2,) blocks of an anchor keyframe, of those that it is matched with, and of the lens; -1 = fixed."""
+        ends = (self.block_of.get(k, -1) for k in (i, *(edge.j for edge in self.by_anchor[i])))
+        return np.array([*ends, self.lens])
+
+    def parts(self) -> Iterator[list[int]]:
+        """The anchor keyframes, some at a time: what they contribute is not held for all of them at once."""
+        anchors = list(self.by_anchor)
+        return (anchors[n : n + AT_ONCE] for n in range(0, len(anchors), AT_ONCE))
 
 
 @dataclass(frozen=True)
@@ -112,31 +129,35 @@ class _Estimate:
     depths: dict[int, Array]  # (p,) inverse
     g: Array  # (6,) intrinsics
 
-    def linearised(self) -> tuple[Array, Array, float]:
+    def linearised(self) -> tuple[Any, Array, float]:
         """The system without the depths; their terms are left with the problem."""
         problem, intrinsics = self.problem, self.problem.intrinsics
-        size = 6 * len(problem.row_of) + N_GLOBAL
-        hess, rhs = np.zeros((size, size)), np.zeros(size)
-        total = self._prior_cost()
-        parts = on_two_threads(self._anchor_part, list(problem.by_anchor))
-        for i, (term, whole_h, whole_b, cost) in zip(problem.by_anchor, parts, strict=True):
-            total += cost
-            problem.terms[i] = term
-            # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
-            seen = term.depth_info > 0  # the rows of other points are zero
-            root = 1 / np.sqrt(term.hdd[seen])
-            scaled = term.cross[seen] * root[:, None]
-            local_h = whole_h - scaled.T @ scaled
-            local_b = whole_b - scaled.T @ (term.bd[seen] * root)
-            keep = term.columns >= 0
-            rows = term.columns[keep]
-            np.add.at(hess, (rows[:, None], rows[None, :]), local_h[np.ix_(keep, keep)])
-            np.add.at(rhs, rows, local_b[keep])
-        free = np.flatnonzero(intrinsics.free)
-        rows = size - N_GLOBAL + free
-        hess[rows, rows] += intrinsics.prior_info[free]
-        rhs[rows] += intrinsics.prior_info[free] * (intrinsics.prior[free] - self.g[free])
-        return hess, rhs, total
+        pattern = problem.pattern
+        equations = DenseEquations(problem.lens + 1) if pattern is None else SparseEquations(pattern)
+        rhs = np.zeros(6 * (problem.lens + 1))
+        total, held = self._prior_cost(), ~intrinsics.free
+        for some in problem.parts():
+            for i, (term, whole_h, whole_b, cost) in zip(some, on_two_threads(self._anchor_part, some), strict=True):
+                total += cost
+                problem.terms[i] = term
+                # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
+                assert term.cross is not None
+                seen = term.depth_info > 0  # the rows of other points are zero
+                root = 1 / np.sqrt(term.hdd[seen])
+                scaled = term.cross[seen] * root[:, None]
+                local_h = whole_h - scaled.T @ scaled
+                local_b = whole_b - scaled.T @ (term.bd[seen] * root)
+                local_h[-N_GLOBAL:][held], local_h[:, -N_GLOBAL:][:, held], local_b[-N_GLOBAL:][held] = 0.0, 0.0, 0.0
+                moves = term.blocks >= 0
+                keep = np.repeat(moves, 6)
+                equations.add(term.blocks[moves], local_h[np.ix_(keep, keep)])
+                np.add.at(rhs, unknowns(term.blocks[moves]), local_b[keep])
+                if pattern is not None:
+                    term.cross = None
+        prior_info = np.where(held, 0.0, intrinsics.prior_info)
+        equations.add(np.array([problem.lens]), np.diag(prior_info))
+        rhs[-N_GLOBAL:] += prior_info * (intrinsics.prior - self.g)
+        return equations.matrix(), rhs, total
 
     def cost(self) -> float:
         """The robust cost, priors included."""
@@ -151,21 +172,33 @@ class _Estimate:
     def moved(self, step: Array) -> _Estimate:
         """The estimate after a step of poses and intrinsics, with the depths that follow from it."""
         poses, depths = dict(self.poses), dict(self.depths)
-        for k, row in self.problem.row_of.items():
-            poses[k] = se3_exp(step[row : row + 6]) @ self.poses[k]
-        for i, term in self.problem.terms.items():
-            local = np.where(term.columns >= 0, step[term.columns], 0.0)
-            delta = (term.bd - term.cross @ local) / term.hdd
-            depth = self.depths[i]
-            least = STEP_AT_INFINITY * _typical(depth)
-            depths[i] = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
+        of_block = step.reshape(-1, 6)
+        for k, block in self.problem.block_of.items():
+            poses[k] = se3_exp(of_block[block]) @ self.poses[k]
+        for some in self.problem.parts():
+            for i, delta in zip(some, on_two_threads(lambda i: self._depth_step(i, of_block), some), strict=True):
+                depth = self.depths[i]
+                least = STEP_AT_INFINITY * _typical(depth)
+                depths[i] = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
         return _Estimate(self.problem, poses, depths, self.g + step[-N_GLOBAL:])
+
+    def _depth_step(self, i: int, of_block: Array) -> Array:
+        """(p,) of an anchor's depths, from the step (n, 6) of all blocks."""
+        term = self.problem.terms[i]
+        cross = self._anchor_part(i)[0].cross if term.cross is None else term.cross
+        local = np.where(term.blocks[:, None] >= 0, of_block[term.blocks], 0.0).reshape(-1)
+        delta: Array = (term.bd - cross @ local) / term.hdd
+        return delta
 
     def _matches(self, i: int) -> tuple[Array, Array, Array]:
         """Targets (m, p, 2), weights (m, p) and j_from_i (m, 4, 4) of an anchor keyframe's edges."""
         edges, world_from_anchor = self.problem.by_anchor[i], inverse(self.poses[i])
         j_from_i = np.stack([self.poses[e.j] @ world_from_anchor for e in edges])
-        return np.stack([e.target for e in edges]), np.stack([e.weight for e in edges]), j_from_i
+        return (
+            np.stack([e.target for e in edges], dtype=float),
+            np.stack([e.weight for e in edges], dtype=float),
+            j_from_i,
+        )
 
     def _anchor_part(self, i: int) -> tuple[_AnchorTerm, Array, Array, float]:
         """What an anchor keyframe's depths are eliminated with, its part of the system before that, its cost."""
@@ -176,11 +209,8 @@ class _Estimate:
         hdd_i = depth_info + v.prior_info + 1e-9
         bd_i = bd.sum(0) + v.prior_info * (v.prior_depth - depth)
         local_h, local_b, cross = _anchor_local(h, b, e, j_from_i)
-        first = 6 * len(problem.row_of)
-        last_columns = np.where(problem.intrinsics.free, np.arange(first, first + N_GLOBAL), -1)
-        ends = [i, *(edge.j for edge in problem.by_anchor[i])]
-        columns = np.concatenate([*(_pose_columns(k, problem.row_of) for k in ends), last_columns])
-        return _AnchorTerm(columns, cross, hdd_i, bd_i, depth_info), local_h, local_b, float(cost.sum())
+        term = _AnchorTerm(problem.blocks_of(i), cross, hdd_i, bd_i, depth_info)
+        return term, local_h, local_b, float(cost.sum())
 
     def _prior_cost(self) -> float:
         variables, intrinsics = self.problem.variables, self.problem.intrinsics
@@ -211,11 +241,6 @@ def _typical(inv_depth: Array) -> float:
     return float(np.abs(inv_depth).mean())
 
 
-def _pose_columns(k: int, row_of: dict[int, int]) -> Array:
-    row = row_of.get(k)
-    return np.full(6, -1) if row is None else np.arange(row, row + 6)
-
-
 def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
     """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, intrinsics]: J_i = -J_j Ad(j_from_i)."""
     m, n = len(h), 6 + 6 * len(h) + N_GLOBAL
@@ -237,10 +262,10 @@ def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array,
     return hess, rhs, anchor_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 
-def _focal_sigma(hess: Array, intrinsics: Intrinsics) -> float:
+def _focal_sigma(hess: Any, intrinsics: Intrinsics) -> float:
     if not intrinsics.free[0]:
         return float("inf")
-    unit = np.zeros(len(hess))
+    unit = np.zeros(hess.shape[0])
     unit[-N_GLOBAL] = 1.0
     column = damped_solve(hess, unit, 1e-9)
     return float("inf") if column is None or column[-N_GLOBAL] <= 0 else float(np.sqrt(column[-N_GLOBAL]))

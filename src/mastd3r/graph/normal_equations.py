@@ -1,0 +1,76 @@
+"""The normal equations of the joint optimisation, block by block: dense where they are small, else sparse.
+
+A block is the six unknowns of one pose, the last one those of the lens. The keyframes that one anchor keyframe is
+matched with are coupled, so a block row has as many blocks as a keyframe has neighbours, however long the video is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import bsr_array
+
+Array = NDArray[Any]
+BLOCK = 6
+DENSE_MOST = 300  # blocks, above: sparse. Below, Cholesky of the whole is faster.
+
+
+class DenseEquations:
+    """H (n, n)."""
+
+    def __init__(self, blocks: int) -> None:
+        self._hess = np.zeros((BLOCK * blocks, BLOCK * blocks))
+
+    def add(self, blocks: Array, part: Array) -> None:
+        """Add ``part`` (6 k, 6 k), whose rows and columns are those of ``blocks`` (k,)."""
+        rows = unknowns(blocks)
+        np.add.at(self._hess, (rows[:, None], rows[None, :]), part)
+
+    def matrix(self) -> Array:
+        """H as it is now."""
+        return self._hess
+
+
+class BlockPattern:
+    """Which blocks of H there are: every pair within a group."""
+
+    def __init__(self, blocks: int, groups: Iterable[Array]) -> None:
+        """``groups``: blocks (k,) that are coupled with one another."""
+        keys = [np.add.outer(g.astype(np.int64) * blocks, g).ravel() for g in groups]
+        self.keys = np.unique(np.concatenate([np.arange(blocks, dtype=np.int64) * (blocks + 1), *keys]))
+        self.blocks = blocks
+        self.indices = (self.keys % blocks).astype(np.int32)
+        self.indptr = np.searchsorted(self.keys, np.arange(blocks + 1, dtype=np.int64) * blocks).astype(np.int32)
+
+    def slots(self, group: Array) -> Array:
+        """(k, k) numbers of the blocks that a group couples."""
+        slots: Array = np.searchsorted(self.keys, np.add.outer(group.astype(np.int64) * self.blocks, group))
+        return slots
+
+
+class SparseEquations:
+    """The same H, of which only the blocks of a pattern are held."""
+
+    def __init__(self, pattern: BlockPattern) -> None:
+        self._pattern = pattern
+        self._data = np.zeros((len(pattern.keys), BLOCK, BLOCK))
+
+    def add(self, blocks: Array, part: Array) -> None:
+        """See ``DenseEquations.add``; the blocks are within a group of the pattern."""
+        k = len(blocks)
+        parts = part.reshape(k, BLOCK, k, BLOCK).transpose(0, 2, 1, 3)
+        np.add.at(self._data, self._pattern.slots(blocks), parts)
+
+    def matrix(self) -> Any:
+        """H as it is now, a scipy.sparse array."""
+        size = BLOCK * self._pattern.blocks
+        return bsr_array((self._data, self._pattern.indices, self._pattern.indptr), shape=(size, size)).tocsc()
+
+
+def unknowns(blocks: Array) -> Array:
+    """(6 k,) rows of the unknowns of ``blocks`` (k,)."""
+    rows: Array = (BLOCK * blocks[:, None] + np.arange(BLOCK)).reshape(-1)
+    return rows
