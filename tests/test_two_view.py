@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from mastd3r.geometry.se3 import inverse, so3_log
 from mastd3r.parts import parts_of
 from mastd3r.pointmap.geometric import GeometricPointmaps
 from mastd3r.slam import Slam
-from mastd3r.tracking.two_view import Start
+from mastd3r.tracking import two_view
+from mastd3r.tracking.two_view import SURE_FEATURES, Start, TwoViewEstimator
 from mastd3r.types import FeatureMatches, Frame, Guess
 from test_pointmap import pair_of
 from test_pointmap_mast3r import FULL, WORK, TrueNetwork, photograph, provider_of
@@ -129,3 +131,19 @@ def test_expected_pairs_are_decoded_once_in_both_orders() -> None:
         for ref, new in ((a, c), (c, a), (b, c), (c, b)):
             provider.predict(ref, new, Guess(WORK))
         assert network.decoded == 4 and network.encoded == 3
+
+
+@pytest.mark.parametrize(
+    ("inliers", "features", "sure"),
+    [(0.8, 0, True), (0.6, 100, True), (0.6, 60, False), (0.6, 0, False), (0.4, 200, False)],
+)
+def test_doubt_is_dispelled_by_dense_matches_or_by_features(
+    monkeypatch: pytest.MonkeyPatch, inliers: float, features: int, sure: bool
+) -> None:
+    view: Any = SimpleNamespace(anchor=None, alignment=SimpleNamespace(inlier_ratio=inliers))
+    px = np.zeros((features, 2))
+    far = FeatureMatches(px, px, np.ones(features)) if features else None
+    monkeypatch.setattr(two_view, "far_features", lambda *_: far)
+    estimator: Any = SimpleNamespace(parts=None)
+    prior: Any = SimpleNamespace(get=lambda: None)
+    assert SURE_FEATURES == 80 and TwoViewEstimator.beyond_doubt(estimator, view, None, prior) == sure  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,22 @@ from ..geometry.se3 import inverse
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
+WITHIN_DEPTHS = (
+    8.0  # of a keyframe's typical depth a view may be away that sees the same: farther, patches do not match
+)
+FEW = 64  # keyframes that are all looked at
+POINTS_STEP = 16  # of those that tell a typical depth
+
+
+def nearby(graph: KeyframeGraph, ids: Sequence[int], cam_from_world: Array) -> list[int]:
+    """Those of ``ids`` that a view may share something with, by distance alone: in a long video a few of many."""
+    if len(ids) <= FEW:
+        return list(ids)
+    poses = np.stack([graph.variables[k].cam_from_world for k in ids])
+    centres = -(poses[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, 3:])[..., 0]
+    away = np.linalg.norm(centres - inverse(cam_from_world)[:3, 3], axis=1)
+    typical = np.array([graph.variables[k].inv_depth[::POINTS_STEP].mean() for k in ids])
+    return [k for k, near in zip(ids, away * typical <= WITHIN_DEPTHS, strict=True) if near]
 
 
 def overlap(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[float, float]:
@@ -40,9 +57,7 @@ def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_over
     """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours."""
     pose = graph.variables[kf_id].cam_from_world
     found = []
-    for k in graph.members():
-        if k >= before:
-            break
+    for k in nearby(graph, [k for k in graph.members() if k < before], pose):
         share, motion = overlap(graph, k, pose)
         if share >= min_overlap and motion < 0.5:
             found.append((motion, k))
@@ -60,9 +75,7 @@ def nearest_keyframe(
 ) -> int | None:
     """The keyframe of the submap being tracked, other than ``but``, with the least image motion to a view."""
     best = None
-    for k in graph.members():
-        if k == but:
-            continue
+    for k in nearby(graph, [k for k in graph.members() if k != but], cam_from_world):
         share, motion = overlap(graph, k, cam_from_world)
         if share >= min_overlap and motion <= max_motion and (best is None or motion < best[0]):
             best = (motion, k)

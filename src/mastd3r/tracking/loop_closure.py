@@ -14,7 +14,7 @@ from ..concurrency import Future
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
-from ..graph.covisibility import overlaps
+from ..graph.covisibility import nearby, overlaps
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
@@ -31,8 +31,9 @@ APART = 3  # keyframes between two of one place, below: they are neighbours
 MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
 MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
-VOTES = 3  # keyframes at either end of loops that agree, for such a turn to be believed
-NEAR_ENDS, SAME_TURN = 8, 0.15  # keyframes, and rad, within which loops agree
+MAX_GAP = 0.15  # of the way between its ends by which a loop may move one against the other, its scale apart
+VOTES = 3  # keyframes at either end of loops that agree, for more than that to be believed
+NEAR_ENDS, SAME_TURN, SAME_GAP = 8, 0.15, 0.05  # keyframes, rad, and share of the way, within which loops agree
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
 LONG_BEFORE = 8  # keyframes; those nearer are matched as neighbours
 COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
@@ -47,13 +48,14 @@ class _Seen:
     there: TwoView
     back: TwoView
     drift: float  # rad by which it would turn what was tracked
+    gap_ratio: float  # by which it would move one end against the other / way between them
 
 
 def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceRecognition) -> list[Loop]:
     """Keyframes of the submap being tracked that look alike, far apart in time: verified both ways, and closed.
 
     Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised. One that
-    would turn more than ``MAX_DRIFT`` is believed only across a passage that is badly explained, and only together
+    asks for more drift than there can be is believed only across a passage that is badly explained, and only together
     with others that say the same: two places may look alike.
     """
     found, doubted = list[_Seen](), list[_Seen]()
@@ -66,7 +68,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
             there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
             back = two_view.relocalised(kf, other.work, Future.done(other.moving / 255.0)) if _strong(there) else None
             seen = _loop(two_view, other.id, j, there, back)
-            if seen is not None and seen.drift <= MAX_DRIFT:
+            if seen is not None and _credible(seen):
                 found.append(seen)
                 break
             if seen is not None:
@@ -84,30 +86,40 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     return loops
 
 
+def _credible(seen: _Seen) -> bool:
+    """Whether tracking may have drifted as a loop says.
+
+    Where lengths have grown, or shrunk, by a factor s along the way, an end is off by up to 1 - 1/s of it. Of two
+    places that look alike the scale is right and the place is not.
+    """
+    by_scale = 1 - np.exp(-abs(np.log(seen.loop.j_from_i.scale)))
+    return seen.drift <= MAX_DRIFT and seen.gap_ratio <= MAX_GAP + by_scale
+
+
 def _connect(graph: KeyframeGraph, seen: _Seen) -> None:
     i, j, there, back = seen.loop.i, seen.loop.j, seen.there.pair.matches, seen.back.pair.matches
     _say(
         graph,
         seen.loop,
-        f"one place, scale {1 / seen.loop.j_from_i.scale:.3f}, {np.degrees(seen.drift):.0f} deg of drift",
+        f"one place, scale {1 / seen.loop.j_from_i.scale:.3f}, {_drift(seen)}",
     )
     graph.connect(i, j, there, static_at(graph.keyframes[j].moving / 255.0, there.new_px))
     graph.connect(j, i, back, static_at(graph.keyframes[i].moving / 255.0, back.new_px))
 
 
 def _voted_for(graph: KeyframeGraph, doubted: list[_Seen]) -> list[_Seen]:
-    """Of loops that would turn much, those that agree with most others, if a badly explained passage lies between."""
+    """Of loops that would move much, those that agree with most others, if a badly explained passage lies between."""
     passages = doubtful_passages(graph) if len(doubted) >= VOTES else []
     across = [s for s in doubted if any(s.loop.i <= p[-1] and p[0] <= s.loop.j for p in passages)]
     best: list[_Seen] = []
     for one in across:
-        agree = [other for other in across if _say_the_same(graph, one.loop, other.loop)]
+        agree = [other for other in across if _say_the_same(graph, one, other)]
         best = max(best, agree, key=len)
     ends = {s.loop.i for s in best}, {s.loop.j for s in best}
     believed = best if min(map(len, ends)) >= VOTES else []
     for s in doubted:
         if s not in believed:
-            _say(graph, s.loop, f"not believed: {np.degrees(s.drift):.0f} deg of drift speak against it")
+            _say(graph, s.loop, f"not believed: {_drift(s)} speak against it")
     return believed
 
 
@@ -117,13 +129,16 @@ def _say(graph: KeyframeGraph, loop: Loop, verdict: str) -> None:
     log.info("keyframes %d and %d, frames %d and %d: %s", loop.i, loop.j, *frames, verdict)
 
 
-def _say_the_same(graph: KeyframeGraph, a: Loop, b: Loop) -> bool:
-    """Whether two loops turn the map alike, by the rotations tracked between their near ends."""
-    if max(abs(a.i - b.i), abs(a.j - b.j)) > NEAR_ENDS:
+def _say_the_same(graph: KeyframeGraph, a: _Seen, b: _Seen) -> bool:
+    """Whether two loops move the map alike, by what was tracked between their near ends."""
+    one, other = a.loop, b.loop
+    if max(abs(one.i - other.i), abs(one.j - other.j)) > NEAR_ENDS:
         return False
-    turn = {k: graph.variables[k].cam_from_world[:3, :3] for k in (a.i, a.j, b.i, b.j)}
-    by_a = (turn[b.j] @ turn[a.j].T) @ a.j_from_i.rotation @ (turn[a.i] @ turn[b.i].T)
-    return float(np.linalg.norm(so3_log(by_a @ b.j_from_i.rotation.T))) <= SAME_TURN
+    pose = {k: Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (one.i, one.j, other.i, other.j)}
+    by_a = (pose[other.j] @ pose[one.j].inverse()) @ one.j_from_i @ (pose[one.i] @ pose[other.i].inverse())
+    turn = float(np.linalg.norm(so3_log(by_a.rotation @ other.j_from_i.rotation.T)))
+    gap = float(np.linalg.norm(by_a.translation - other.j_from_i.translation))
+    return turn <= SAME_TURN and gap <= SAME_GAP * min(_way(graph, one.i, one.j), _way(graph, other.i, other.j))
 
 
 def _alike(two_view: TwoViewEstimator, graph: KeyframeGraph, j: int, far: list[int]) -> list[Keyframe]:
@@ -166,7 +181,24 @@ def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, bac
         j_from_i = Sim3.from_rigid(inverse(back.alignment.new_from_ref), scale)
     else:
         j_from_i = Sim3.from_rigid(there.alignment.new_from_ref).in_lengths(scale)
-    return _Seen(Loop(i, j, j_from_i, float(better.weight.sum())), there, back, drift)
+    gap_ratio = _gap_ratio(graph, i, j, j_from_i)
+    return _Seen(Loop(i, j, j_from_i, float(better.weight.sum())), there, back, drift, gap_ratio)
+
+
+def _gap_ratio(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> float:
+    """How far from where tracking has it a loop puts camera i, seen from camera j, / length of the way from i to j."""
+    tracked = graph.variables[j].cam_from_world @ inverse(graph.variables[i].cam_from_world)
+    return float(np.linalg.norm(j_from_i.translation - tracked[:3, 3])) / max(_way(graph, i, j), 1e-12)
+
+
+def _way(graph: KeyframeGraph, i: int, j: int) -> float:
+    """Length of the tracked way from keyframe i to a later one j, map units."""
+    centres = np.stack([graph.world_from_cam(k)[:3, 3] for k in graph.members() if i <= k <= j])
+    return float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
+
+
+def _drift(seen: _Seen) -> str:
+    return f"{np.degrees(seen.drift):.0f} deg and {seen.gap_ratio:.0%} of the way of drift"
 
 
 def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
@@ -178,14 +210,21 @@ def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int,
     ids = graph.members()
     done = graph.connected_pairs()
     pairs = []
-    poses = np.stack([graph.variables[k].cam_from_world for k in ids])
-    shared = {i: overlaps(graph, i, poses) for i in ids}
-    for a, i in enumerate(ids):
-        for b, j in enumerate(ids[:a]):
-            share = min(shared[i][0][b], shared[j][0][a])
-            motion = max(shared[i][1][b], shared[j][1][a])
-            if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION and frozenset((i, j)) not in done:
+    shared = {i: _shared(graph, i, ids) for i in ids}
+    for i in ids:
+        for j in shared[i]:
+            if j >= i or i not in shared[j] or frozenset((i, j)) in done:
+                continue
+            share, motion = min(shared[i][j][0], shared[j][i][0]), max(shared[i][j][1], shared[j][i][1])
+            if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION:
                 pairs.append((-share, j, i))
     made = connect([(i, j) for _, i, j in sorted(pairs)[: COVISIBLE_PAIRS * len(ids)]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made
+
+
+def _shared(graph: KeyframeGraph, i: int, ids: list[int]) -> dict[int, tuple[float, float]]:
+    """(share of i's points in view, their motion) of each keyframe that may see what i sees, by the poses."""
+    near = nearby(graph, ids, graph.variables[i].cam_from_world)
+    share, motion = overlaps(graph, i, np.stack([graph.variables[k].cam_from_world for k in near]))
+    return {k: (float(s), float(m)) for k, s, m in zip(near, share, motion, strict=True)}
