@@ -4,6 +4,7 @@ Results never depend on which thread was faster. And what a request to stop must
 
 from __future__ import annotations
 
+import ctypes
 import itertools
 import os
 import sys
@@ -257,6 +258,27 @@ def in_blocks(kernel: Callable[..., Any], count: int, *arguments: Any, threads: 
     futures = [pool.submit(kernel, a, b, *arguments) for a, b in itertools.pairwise(edges)]
     for future in futures:
         future.result()
+
+
+@cache
+def _allocator() -> Any:
+    """The C library whose heap can be trimmed; None elsewhere than under glibc."""
+    if not sys.platform.startswith("linux"):
+        return None
+    try:
+        return ctypes.CDLL("libc.so.6") if hasattr(ctypes.CDLL("libc.so.6"), "malloc_trim") else None
+    except OSError:  # musl
+        return None
+
+
+def give_back_memory() -> None:
+    """Free memory between what is kept goes back to the system, where the allocator can.
+
+    Threads that make short-lived arrays beside long-lived ones leave holes: on a long video as much as all keyframes.
+    """
+    library = _allocator()
+    if library is not None:
+        library.malloc_trim(0)
 
 
 @contextmanager

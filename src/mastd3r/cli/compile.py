@@ -117,7 +117,10 @@ def _solver() -> None:
         variables[k] = KeyframeVariables(px.copy(), ones.copy(), ones.copy(), 0.01 * ones, pose)
     moved = np.array([25.0, 0.0])  # px from one camera to the next
     pairs = [(i, j) for i in range(3) for j in range(3) if i != j]
-    edges = [ReprojectionFactor(i, j, px + (i - j) * moved, np.ones(len(px))) for i, j in pairs]
+    edges = [
+        ReprojectionFactor(i, j, (px + (i - j) * moved).astype(np.float32), np.ones(len(px), np.float32))
+        for i, j in pairs
+    ]
     intrinsics = intrinsics_for(Config().camera, 320, 240, (320, 240))
     solve(variables, edges, intrinsics, fixed=frozenset({0}), iterations=2)
     one = np.ones(len(px))

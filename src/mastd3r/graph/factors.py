@@ -17,8 +17,8 @@ class ReprojectionFactor:
 
     i: int
     j: int
-    target: Array  # (p, 2) float64 pixels in j
-    weight: Array  # (p,) float64, 0 = no match
+    target: Array  # (p, 2) float32 pixels in j
+    weight: Array  # (p,) float32, 0 = no match
 
 
 def thinned_edge(edge: ReprojectionFactor, step: int) -> ReprojectionFactor:

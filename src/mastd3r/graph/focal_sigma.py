@@ -56,7 +56,7 @@ def residual_sigma_px(graph: KeyframeGraph, kernel_px: float) -> float:
     for e in graph.edges:
         v = graph.variables[e.i]
         j_from_i = graph.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
-        residual, _ = edge_residuals(v.px, v.inv_depth, e.target, j_from_i, graph.intrinsics.values)
+        residual, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, graph.intrinsics.values)
         r2 = (residual**2).sum(1)
         u = e.weight / (1 + r2 / kernel_px**2)
         squares, weights = squares + float((u**2 * r2).sum()), weights + float(u.sum())

@@ -164,7 +164,7 @@ def _errors_px(graph: KeyframeGraph) -> list[Array]:
     for e in graph.edges:
         v = graph.variables[e.i]
         j_from_i = graph.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
-        residual, _ = edge_residuals(v.px, v.inv_depth, e.target, j_from_i, graph.intrinsics.values)
+        residual, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, graph.intrinsics.values)
         out.append(np.hypot(residual[:, 0], residual[:, 1]))
     return out
 
@@ -247,7 +247,7 @@ def _two_view(graph: KeyframeGraph, edge: ReprojectionFactor) -> bool:
     g = graph.intrinsics.values
     f = float(np.exp(g[0]))
     matrix = np.array([[f, 0, g[2]], [0, f, g[3]], [0, 0, 1.0]])
-    a, b = graph.variables[edge.i].px[used], edge.target[used]
+    a, b = graph.variables[edge.i].px[used], edge.target[used].astype(float)
     essential, inlier = cv2.findEssentialMat(a, b, matrix, cv2.USAC_MAGSAC, 0.999, 0.7)
     if essential is None or essential.shape != (3, 3):
         return False

@@ -171,7 +171,7 @@ class KeyframeGraph:
         least = 0.0 if followed else self.config.min_match_ratio
         if (weight > USABLE_WEIGHT).mean() < least or (weight > USABLE_WEIGHT).sum() < 20:
             return None
-        return ReprojectionFactor(i, j, matches.new_px, weight)
+        return ReprojectionFactor(i, j, matches.new_px.astype(np.float32), weight.astype(np.float32))
 
     def connect(self, i: int, j: int, matches: Matches, static_new: Array, *, followed: bool = False) -> bool:
         """Add an ``edge``; False where there is none."""

@@ -115,5 +115,5 @@ def _near_share(
 def _pair(variables: Variables, edge: ReprojectionFactor, intrinsics: Intrinsics) -> PairMotion:
     v, used = variables[edge.i], edge.weight > USABLE_WEIGHT
     j_from_i = variables[edge.j].cam_from_world @ inverse(v.cam_from_world)
-    residual, _ = edge_residuals(v.px, v.inv_depth, edge.target, j_from_i, intrinsics.values)
-    return PairMotion(edge.i, edge.j, v.px[used], edge.target[used], residual[used])
+    residual, _ = edge_residuals(v.px, v.inv_depth, edge.target.astype(float), j_from_i, intrinsics.values)
+    return PairMotion(edge.i, edge.j, v.px[used], edge.target[used].astype(float), residual[used])

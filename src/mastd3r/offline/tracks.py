@@ -68,7 +68,7 @@ def _matched(
     for edge in graph.edges:
         if edge.i == kf_id and edge.j in row_of_kf:
             used = np.flatnonzero(edge.weight > USABLE_WEIGHT)
-            yield row_of_kf[edge.j], used, edge.target[used]
+            yield row_of_kf[edge.j], used, edge.target[used].astype(float)
     for row, n in enumerate(rows):
         record = final[n].record
         if record.kf_id == kf_id and not record.is_keyframe:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..concurrency import Future, Worker
+from ..concurrency import Future, Worker, give_back_memory
 from ..config import Config
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse
@@ -33,6 +33,7 @@ WHOLE_ITERATIONS, WHOLE_KERNEL_PX = 6, 1.0  # of that solve
 KNOWN_ITERATIONS = 4  # of the one where a known place closes a detour
 DEPTH_KNOWN = 0.1  # share of a first keyframe's points with a measured depth, above: it needs no parallax
 KNOWN_PLACE_MATCHED = 0.4  # share of an older keyframe's points matched, above: it is followed instead of a new one
+GIVEN_BACK_EVERY = 16  # keyframes, after which memory that is free goes back to the system
 THIN_MOTION = 0.4  # of a keyframe's motion: where matches are thin that is enough
 SLOW_MOTION, SLOW_FRAMES = 0.5, 15  # of the motion before a start, and the frames after which it is enough
 LAST_MOTION = 0.3  # of the same: enough for the last frame of the video
@@ -144,6 +145,8 @@ class Keyframes:
     def _add(self, state: TrackingState, view: TwoView) -> TrackingState:
         """The frame recorded last becomes a keyframe, matched with those before it, and the window is optimised."""
         self._before_another()
+        if len(self.graph.keyframes) % GIVEN_BACK_EVERY == 0:
+            give_back_memory()
         graph, before, last = self.graph, state.anchor, state.last
         assert before is not None and last is not None
         work, mask = last.work, last.moving.get()

@@ -203,7 +203,7 @@ class LiveKeyframes(Keyframes):
         edge = next((e for e in graph.edges if (e.i, e.j) == (before, kf.id)), None)
         if edge is not None:
             info, lens = graph.depth_info(before), graph.intrinsics.values
-            matches = StaticMatches(v.px, v.inv_depth, info, edge.target, edge.weight, lens)
+            matches = StaticMatches(v.px, v.inv_depth, info, edge.target.astype(float), edge.weight.astype(float), lens)
             for kernel_px in (8.0, 3.0, 1.0):
                 pose = solve_pose(matches, pose, kernel_px=kernel_px).new_from_ref
         cam_from_world = pose @ v.cam_from_world
