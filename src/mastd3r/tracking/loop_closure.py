@@ -14,7 +14,7 @@ from ..concurrency import Future
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
-from ..graph.covisibility import nearby, overlaps
+from ..graph.covisibility import WITHIN_DEPTHS, nearby, overlaps
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
@@ -32,6 +32,7 @@ MIN_MATCHES, MIN_INLIERS = 100, 0.4  # both ways, for a loop to be accepted
 MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, log
 MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
 MAX_GAP = 0.15  # of the way between its ends by which a loop may move one against the other, its scale apart
+MOST_TRIED, PRIOR_GAP = 128, 0.3  # keyframes that are all tried, and that share of the way, above
 VOTES = 3  # keyframes at either end of loops that agree, for more than that to be believed
 NEAR_ENDS, SAME_TURN, SAME_GAP = 8, 0.15, 0.05  # keyframes, rad, and share of the way, within which loops agree
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
@@ -59,10 +60,11 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     with others that say the same: two places may look alike.
     """
     found, doubted = list[_Seen](), list[_Seen]()
-    ids, joined = graph.members(), graph.connected_pairs()
+    ids, joined, chain = graph.members(), graph.connected_pairs(), _Chain(graph)
     for j in ids:
         kf = graph.keyframes[j]
-        far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
+        far = [i for i in chain.within_drift(j) if frozenset((i, j)) not in joined]
+        far = [i for i in far if not _known(found, i, j) and not _enough_of(doubted, i, j)]
         small = not_unlike(two_view.parts, kf.work, places.best(graph, kf.work, far, 2, MIN_SIMILARITY))
         for other in [*small, *_alike(two_view, graph, j, far)]:
             there = two_view.relocalised(other, kf.work, Future.done(kf.moving / 255.0))
@@ -84,6 +86,33 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     if voted:  # the ends of what was badly explained have moved far
         retake_passages(graph)
     return loops
+
+
+class _Chain:
+    """The way of the submap being tracked, and who may have been where by it."""
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        self._ids = graph.members()
+        self._centres = np.stack([graph.world_from_cam(k)[:3, 3] for k in self._ids])
+        steps = np.linalg.norm(np.diff(self._centres, axis=0), axis=1)
+        self._way = np.concatenate([[0.0], np.cumsum(steps)])
+        self._reach = WITHIN_DEPTHS / np.array([graph.median_inv_depth(k) for k in self._ids])
+        long = len(self._ids) > MOST_TRIED
+        self._doubted = [p[0] for p in doubtful_passages(graph)] if long else []
+
+    def within_drift(self, j: int) -> list[int]:
+        """Keyframes well before j that may be where j is; of few all.
+
+        Of many those that no credible drift keeps from it, or that a badly explained passage separates from it.
+        """
+        n = self._ids.index(j)
+        before = [m for m in range(n) if self._ids[m] < j - APART]
+        if len(before) > MOST_TRIED:
+            apart = np.linalg.norm(self._centres[before] - self._centres[n], axis=1)
+            near = apart <= PRIOR_GAP * (self._way[n] - self._way[before]) + self._reach[n]
+            last = max((k for k in self._doubted if k < j), default=-1)
+            before = [m for m, ok in zip(before, near, strict=True) if ok or self._ids[m] < last]
+        return [self._ids[m] for m in before]
 
 
 def _credible(seen: _Seen) -> bool:
@@ -152,6 +181,12 @@ def _alike(two_view: TwoViewEstimator, graph: KeyframeGraph, j: int, far: list[i
 def _known(found: list[_Seen], i: int, j: int) -> bool:
     """Keyframes next to the ends of a loop are matched later, by their poses."""
     return any(abs(i - s.loop.i) <= APART and abs(j - s.loop.j) <= APART for s in found)
+
+
+def _enough_of(doubted: list[_Seen], i: int, j: int) -> bool:
+    """Two places that look alike do so from all around: after twice the votes that are needed nobody else is asked."""
+    near = [s for s in doubted if abs(i - s.loop.i) <= NEAR_ENDS and abs(j - s.loop.j) <= NEAR_ENDS]
+    return len(near) >= 2 * VOTES
 
 
 def _strong(view: TwoView | None) -> bool:
