@@ -239,7 +239,7 @@ def test_a_part_from_outside_can_be_chosen_while_it_is_there(registry: Registry,
 
 
 def test_the_paper_preset_takes_everything_as_printed() -> None:
-    assert list(PRESETS) == ["paper"]
+    assert list(PRESETS) == ["fast", "quality", "paper"]
     paper, expected = preset("paper"), Config()
     for item in (
         "dynamics.variant=paper",
@@ -251,7 +251,7 @@ def test_the_paper_preset_takes_everything_as_printed() -> None:
     assert paper == expected
     for key in options_as_printed():
         assert leaf(paper, key) != leaf(Config(), key), key
-    with pytest.raises(ConfigError, match="preset: expected one of paper, got 'papr'"):
+    with pytest.raises(ConfigError, match="preset: expected one of fast, quality, paper, got 'papr'"):
         preset("papr")
 
 

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from mastd3r.camera.pinhole import Camera
+from mastd3r.dynamics.appearance import AppearanceClassifier
+from mastd3r.dynamics.causal import CausalMasks
 from mastd3r.dynamics.config import DepthConfig, DynamicsConfig, MotionConfig, TemporalConfig
 from mastd3r.dynamics.data import DynamicMask, DynamicsInput
 from mastd3r.dynamics.filter import LogOddsFilter
@@ -224,3 +226,26 @@ def test_wrong_size_is_one_clear_line() -> None:
     gray, pose, _ = frame(0, 3.0)
     with pytest.raises(InputError, match="own_inv_depth"):
         mask_filter.update(input_of(0, gray, pose, own_inv_depth=np.zeros((4, 4), np.float32)))
+
+
+def test_causal_masks_are_those_of_the_filter_and_never_see_what_follows() -> None:
+    model: DynamicsModel = DYNAMICS.create("ours", DynamicsConfig())
+    views = [frame(i, 3.0) for i in range(5)]
+    inputs = [(input_of(i, gray, pose), i) for i, (gray, pose, _) in enumerate(views)]
+    inputs[2] = (replace(inputs[2][0], pose_known=False), 2)
+    whole = list(CausalMasks(model.filter(W, H)).masks(inputs))
+    part = list(CausalMasks(model.filter(W, H)).masks(inputs[:4]))
+    assert [beside for _, beside in whole] == [0, 1, 2, 3, 4]
+    for (mask, _), (same, _) in zip(whole[:4], part, strict=True):
+        np.testing.assert_array_equal(mask.probability, same.probability)
+    alone, expected = model.filter(W, H), []
+    for one, _ in inputs:
+        prior = alone.prior(one.gray)
+        expected.append(alone.update(one).probability if one.pose_known else prior)
+    for (mask, _), probability in zip(whole, expected, strict=True):
+        np.testing.assert_array_equal(mask.probability, probability)
+    assert whole[2][0].evidence == {} and iou(whole[4][0], views[4][2]) > 0.5
+    learned = AppearanceClassifier(DynamicsConfig())
+    begun = model.filter(W, H)
+    CausalMasks(begun, learned)
+    assert begun.appearance is learned  # type: ignore[attr-defined]

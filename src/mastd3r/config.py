@@ -54,6 +54,7 @@ SourceKind = Literal[
 MapDeviceKind = Literal["auto", "cpu", "cuda"]
 PrecisionKind = Literal["auto", "float32", "bfloat16", "float16"]
 CloudKind = Literal["sparse", "dense"]
+MasksKind = Literal["smoothed", "causal"]
 ExecutionKind = Literal["auto", "eager", "graph", "compile"]
 
 
@@ -183,6 +184,7 @@ class Config:
     places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"
     cloud: CloudKind = "sparse"  # dense: depth of every keyframe pixel too, as cloud_dense.ply; a minute or two
+    masks: MasksKind = "smoothed"  # of the second pass; causal: they know the frames before alone, in half the time
     scale: str = ""  # what metres are taken from, as --scale says it (metric/spec.py); empty: lengths stay map units
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     source: SourceConfig = field(default_factory=SourceConfig)
@@ -196,6 +198,8 @@ class Config:
 
 
 PRESETS: dict[str, tuple[str, ...]] = {  # name -> what it changes of the defaults, as ``with_override`` takes it
+    "fast": ("masks=causal", "mapping.quality=draft"),  # a first look
+    "quality": ("cloud=dense", "mapping.quality=high"),  # what there is time for overnight
     "paper": (  # every equation as printed
         "dynamics.variant=paper",
         "alignment.as_printed=true",

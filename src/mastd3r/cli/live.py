@@ -25,7 +25,7 @@ CAMERA_HELP = (
     "input; a ROS bag or MCAP file; a video, folder or dataset, played at its own pace"
 )
 # by --set, or not at all
-NOT_LIVE = ("pointmaps", "semantics", "maps", "cloud", "scale", "seed", "map_loss", "map_minutes")
+NOT_LIVE = ("pointmaps", "semantics", "maps", "cloud", "masks", "scale", "seed", "map_loss", "map_minutes")
 PIXEL_FORMATS = ("bgr24", "rgb24", "gray8")
 
 

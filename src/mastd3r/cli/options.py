@@ -25,7 +25,7 @@ def config_from_args(args: argparse.Namespace) -> Config:
         config = config_from_yaml(args.config, config)
     for item in args.set:
         config = with_override(config, item)
-    for name in ("pointmaps", "semantics", "correction", "cloud", "seed"):
+    for name in ("pointmaps", "semantics", "correction", "cloud", "masks", "seed"):
         if getattr(args, name) is not None:
             config = replace(config, **{name: getattr(args, name)})
     window = {k: getattr(args, k) for k in ("start", "end", "stride", "kind") if getattr(args, k) is not None}

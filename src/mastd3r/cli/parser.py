@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn, get_args
 
 from .. import __version__
-from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, SourceKind
+from ..config import PRESETS, CloudKind, Config, MapLossKind, MapQualityKind, MasksKind, SourceKind
 from ..errors import ConfigError
 from ..export.kinds import KINDS
 from ..metric.spec import FORMS
@@ -37,6 +37,11 @@ MINUTES_HELP = "train the map for so long, instead of for the number of steps of
 
 FORMS_SHOWN = ", ".join(FORMS.values())
 SCALE_HELP = f"everything in metres, taken from {FORMS_SHOWN} (default: map units)"
+MASKS_HELP = (
+    "of the second pass: from frames before and after, or causal: from those before alone, in half the time "
+    f"(default {Config().masks})"
+)
+PRESET_HELP = "many options at once; fast: a first look; quality: dense cloud, finest map; paper: everything as printed"
 CLOUD_HELP = f"dense: depth of every keyframe pixel too, as cloud_dense.ply (default {Config().cloud})"
 
 
@@ -148,7 +153,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=path, required=True, help="run folder")
     p.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     p.add_argument("--config", type=path, help="YAML file with options that differ from the defaults")
-    p.add_argument("--preset", choices=tuple(PRESETS), help="many options at once; paper: everything as printed")
+    p.add_argument("--preset", choices=tuple(PRESETS), help=PRESET_HELP)
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
     p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
@@ -158,6 +163,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
     p.add_argument("--map-minutes", type=float, metavar="M", help=MINUTES_HELP)
     p.add_argument("--cloud", choices=get_args(CloudKind), help=CLOUD_HELP)
+    p.add_argument("--masks", choices=get_args(MasksKind), help=MASKS_HELP)
     p.add_argument("--no-map", action="store_true", help="trajectory, masks and cloud only")
     p.add_argument("--no-loops", action="store_true", help="places that are seen again do not close the trajectory")
     p.add_argument("--scale", metavar="BY", help=SCALE_HELP)

@@ -16,6 +16,7 @@ from ..camera.map_view import MapView
 from ..camera.rectification import Rectifier
 from ..concurrency import Future, Worker, prefetch
 from ..config import HOLDOUT_EVERY, Config
+from ..dynamics.causal import CausalMasks
 from ..dynamics.data import DynamicMask, DynamicsInput
 from ..dynamics.flow import HalfFlow
 from ..dynamics.soft_mask import static_at
@@ -23,6 +24,7 @@ from ..dynamics.uncertainty import RESIDUAL_MAX_PX, SeenFrom, reprojection_resid
 from ..geometry.se3 import inverse, transform
 from ..graph.keyframe_graph import KeyframeGraph
 from ..parts import Parts
+from ..protocols import DynamicsSmoother
 from ..sources.rectified import rectified
 from ..tracking.mask_input import dynamics_input
 from ..tracking.observation import Observer
@@ -104,9 +106,9 @@ def smooth_masks(
     them what tracking saw. A mask waits for frames after it, so a few frames are held, never the video.
     """
     out, votes = SmoothedMasks(), PointVotes()
-    graph, parts = context.graph, context.parts
+    graph = context.graph
     chosen = view_positions(context.final, context.config)
-    smoother = parts.dynamics.smoother(*parts.provider.size, context.appearance)
+    smoother = _smoother(context)
     uncoloured: list[int] = []  # keyframes without colours yet
     written = deque[Future[None]]()
     inputs = prefetch(_inputs(frames, context, chosen), lambda _, __: None, lambda: None)
@@ -138,6 +140,13 @@ def smooth_masks(
             written.popleft().get()
     out.moving = votes.moving()
     return out
+
+
+def _smoother(context: SmoothingContext) -> DynamicsSmoother:
+    dynamics, size = context.parts.dynamics, context.parts.provider.size
+    if context.config.masks == "causal":
+        return CausalMasks(dynamics.filter(*size), context.appearance)
+    return dynamics.smoother(*size, context.appearance)
 
 
 def _inputs(
