@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import inverse, se3_exp, so3_log
+from mastd3r.graph import passages as passages_module
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.passages import (
     LENGTH,
@@ -58,7 +59,14 @@ def off_deg(graph: KeyframeGraph, truth: dict[int, Array]) -> float:
     return float(np.degrees(worst))
 
 
-def test_a_passage_in_a_minimum_of_its_own_is_solved_anew(exact_scene: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("is_long", [False, True])
+def test_a_passage_in_a_minimum_of_its_own_is_solved_anew(
+    exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, is_long: bool
+) -> None:
+    """Of a long chain its surroundings alone are solved with it."""
+    if is_long:
+        monkeypatch.setattr(passages_module, "LONG", VIEWS - 1)
+        monkeypatch.setattr(passages_module, "AROUND", 3)
     graph = chain(exact_scene)
     truth = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
     assert off_deg(graph, truth) == 0.0
@@ -66,6 +74,8 @@ def test_a_passage_in_a_minimum_of_its_own_is_solved_anew(exact_scene: Callable[
     assert off_deg(graph, truth) > 3.0  # the solver does not leave it by itself
     passages = doubtful_passages(graph)
     assert passages and set(passages[0]) & set(range(BROKEN, VIEWS))
+    if is_long:
+        monkeypatch.setattr(KeyframeGraph, "solve_all", lambda *_: pytest.fail("the whole chain was solved"))
     retake_passages(graph)
     assert off_deg(graph, truth) < 0.3
     length = np.linalg.norm(graph.world_from_cam(VIEWS - 1)[:3, 3] - graph.world_from_cam(VIEWS - 2)[:3, 3])

@@ -37,7 +37,8 @@ MOST_DOUBTED = 6  # passages looked at in one round, the worst first
 ROUNDS = 3
 BETTER = 0.85  # of the cost, for another explanation to be taken
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
-WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # the same of the whole chain, before and after a passage is changed
+WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # the same of the chain, before and after a passage is changed
+LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
 DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
 
 
@@ -104,9 +105,9 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
     if best is None:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
-    before, kept, lens = _whole_cost(graph), _state(graph), graph.intrinsics
+    before, kept, lens = _cost_around(graph, ids), _state(graph), graph.intrinsics
     replace_passage(graph, ids, best[1])
-    after = _whole_cost(graph)
+    after = _cost_around(graph, ids)
     if after < before:
         log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
                  before, after)  # fmt: skip
@@ -170,8 +171,22 @@ def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     return cost
 
 
-def _whole_cost(graph: KeyframeGraph) -> float:
-    return [graph.solve_all(iterations, kernel_px) for kernel_px, iterations in WHOLE][-1].cost_last
+def _cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
+    """What the whole chain costs once it is solved; of a long one the keyframes around a passage.
+
+    Those before stay where they are, those after come along.
+    """
+    members = graph.members()
+    if len(members) <= LONG:
+        return [graph.solve_all(iterations, kernel_px) for kernel_px, iterations in WHOLE][-1].cost_last
+    first, last = members.index(ids[0]), members.index(ids[-1])
+    around = members[max(first - AROUND, 0) : last + AROUND + 1]
+    window = Window(around, graph.edges_among(around), frozenset(around[:1]), ALL_INTRINSICS)
+    old_end = graph.variables[around[-1]].cam_from_world
+    cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in WHOLE][-1].cost_last
+    moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end
+    graph.transform_keyframes(members[last + AROUND + 1 :], Sim3.from_rigid(moved))
+    return cost
 
 
 def _state(graph: KeyframeGraph) -> State:
