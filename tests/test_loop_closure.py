@@ -286,7 +286,7 @@ def test_a_large_turn_needs_a_bad_passage_and_loops_that_agree(
     believed: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("mastd3r.tracking.loop_closure.doubtful_passages", lambda _: passages)
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.doubtful_passages", lambda *_: passages)
     retaken: list[KeyframeGraph] = []
     monkeypatch.setattr("mastd3r.tracking.loop_closure.retake_passages", retaken.append)
     graph, centres = drifted(scene, turn=np.array([0, 0, 0, 0, 0.75, 0.0]))

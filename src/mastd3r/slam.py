@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera.rectification import Rectifier, rectifier_for
-from .concurrency import Future, one_blas_thread, undivided
+from .concurrency import Future, give_back_memory, one_blas_thread, undivided
 from .config import Config, check_config
 from .errors import ConfigError, InputError
 from .export.run_folder import RunFolder
@@ -165,6 +165,7 @@ class Slam:
         if not solved:
             job.solve()  # joint optimisation: graph/bundle_adjustment.py; every frame's pose: offline/final_solve.py
             job.keep("solved", self.memory)
+            give_back_memory()
         material = job.smooth_masks(self.masks.filter.appearance)  # III-A, forward-backward: dynamics/smoother.py;
         # (15)(16): dynamics/uncertainty.py; static cloud: offline/static_cloud.py
         job.make_map(material)  # III-C: Algorithm 1: mapping/mapper.py; (13)-(17): mapping/losses.py
@@ -206,6 +207,7 @@ class Slam:
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view)
         self.masks.close()
         self.keyframes.close()
+        give_back_memory()
 
     def prefetched(self, photographs: Iterator[Frame]) -> Iterator[Frame]:
         """Frames for ``track``, each read, and looked at, while the one before is tracked."""

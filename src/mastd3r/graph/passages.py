@@ -62,8 +62,10 @@ def retake_passages(graph: KeyframeGraph) -> int:
     return taken
 
 
-def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
-    """Passages that cost more for what their matches weigh than others, the worst first; those that touch as one.
+def doubtful_passages(graph: KeyframeGraph, times: float = DOUBTFUL) -> list[list[int]]:
+    """Passages that cost so many times more for what their matches weigh than others, the worst first.
+
+    Those that touch come as one, too.
 
     None where depths are measured: their scale is not ours to change, and a passage by itself does not know it.
     """
@@ -72,7 +74,7 @@ def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
         return []
     firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]
     costs = np.array([_cost_of_weight(graph, ids[n : n + LENGTH]) for n in firsts])
-    bound = DOUBTFUL * float(np.median(costs))
+    bound = times * float(np.median(costs))
     found: list[tuple[float, list[int]]] = []
     for n in np.flatnonzero(costs > bound):
         found.append((costs[n], ids[firsts[n] : firsts[n] + LENGTH]))

@@ -14,7 +14,7 @@ from ..concurrency import Future
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
-from ..graph.covisibility import WITHIN_DEPTHS, nearby, overlaps
+from ..graph.covisibility import nearby, overlaps
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
@@ -33,6 +33,8 @@ MAX_TURN, MAX_LOG_SCALE = 0.4, 0.3  # by which there and back may differ: rad, l
 MAX_DRIFT = 0.6  # rad by which a loop may turn what was tracked: more is two places that look alike
 MAX_GAP = 0.15  # of the way between its ends by which a loop may move one against the other, its scale apart
 MOST_TRIED, PRIOR_GAP = 128, 0.3  # keyframes that are all tried, and that share of the way, above
+OVERLAP_DEPTHS = 3.0  # typical depths within which two views may show one place
+BROKEN = 2.0  # times the median passage's cost for its weight: there tracking may have lost its way altogether
 VOTES = 3  # keyframes at either end of loops that agree, for more than that to be believed
 NEAR_ENDS, SAME_TURN, SAME_GAP = 8, 0.15, 0.05  # keyframes, rad, and share of the way, within which loops agree
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
@@ -96,21 +98,24 @@ class _Chain:
         self._centres = np.stack([graph.world_from_cam(k)[:3, 3] for k in self._ids])
         steps = np.linalg.norm(np.diff(self._centres, axis=0), axis=1)
         self._way = np.concatenate([[0.0], np.cumsum(steps)])
-        self._reach = WITHIN_DEPTHS / np.array([graph.median_inv_depth(k) for k in self._ids])
-        long = len(self._ids) > MOST_TRIED
-        self._doubted = [p[0] for p in doubtful_passages(graph)] if long else []
+        self._overlap = OVERLAP_DEPTHS / np.array([graph.median_inv_depth(k) for k in self._ids])
+        self._broken = [p[0] for p in doubtful_passages(graph, BROKEN)] if len(self._ids) > MOST_TRIED else []
 
     def within_drift(self, j: int) -> list[int]:
         """Keyframes well before j that may be where j is; of few all.
 
-        Of many those that no credible drift keeps from it, or that a badly explained passage separates from it.
+        Of many those that no credible drift keeps from it, after a way on which there was something to drift, and those
+        that a passage separates from it in which tracking broke.
         """
         n = self._ids.index(j)
         before = [m for m in range(n) if self._ids[m] < j - APART]
         if len(before) > MOST_TRIED:
-            apart = np.linalg.norm(self._centres[before] - self._centres[n], axis=1)
-            near = apart <= PRIOR_GAP * (self._way[n] - self._way[before]) + self._reach[n]
-            last = max((k for k in self._doubted if k < j), default=-1)
+            apart, way = (
+                np.linalg.norm(self._centres[before] - self._centres[n], axis=1),
+                self._way[n] - self._way[before],
+            )
+            near = (apart <= PRIOR_GAP * way + self._overlap[n]) & (way > self._overlap[n])
+            last = max((k for k in self._broken if k < j), default=-1)
             before = [m for m, ok in zip(before, near, strict=True) if ok or self._ids[m] < last]
         return [self._ids[m] for m in before]
 
