@@ -2,9 +2,10 @@
 
 usage: python benchmarks/tables.py results.json docs/results.md
 
-Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, localise.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of each bench
-under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
+Beside results.json: endurance.json, endless.json, corrections.json, networks.json, reference.json, masks.json,
+dense.json, live.json, localise.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of
+each bench under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside
+it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mastd3r.experiments.store import read_results
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
 from dense_table import dense
+from endless_table import endless
 from live_table import live
 from localise_table import localise
 from map_tables import map_sections
@@ -94,7 +96,8 @@ def main() -> int:
     lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
     lines += localise(source.parent / "localise.json")
-    lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
+    lines += [*endurance(source.parent / "endurance.json"), *endless(source.parent / "endless.json")]
+    lines += reference(source.parent / "reference.json")
     lines += corrections(source.parent / "corrections.json")
     lines += networks(source.parent / "networks.json")
     lines += masks(source.parent / "masks.json")
