@@ -66,7 +66,7 @@ def doubtful_passages(graph: KeyframeGraph) -> list[list[int]]:
 
     None where depths are measured: their scale is not ours to change, and a passage by itself does not know it.
     """
-    ids = graph.members()
+    ids = graph.free_members()
     if len(ids) < 2 * LENGTH or graph.depths_measured:
         return []
     firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]

@@ -58,7 +58,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     """
     found, doubted = list[_Seen](), list[_Seen]()
     ids, joined = graph.members(), graph.connected_pairs()
-    for j in ids:
+    for j in graph.free_members():
         kf = graph.keyframes[j]
         far = [i for i in ids if i < j - APART and frozenset((i, j)) not in joined and not _known(found, i, j)]
         small = not_unlike(two_view.parts, kf.work, places.best(graph, kf.work, far, 2, MIN_SIMILARITY))
@@ -176,16 +176,17 @@ def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int,
     the chain together across them. At most ``COVISIBLE_PAIRS`` a keyframe, those that share most first.
     """
     ids = graph.members()
-    done = graph.connected_pairs()
+    done, held = graph.connected_pairs(), graph.held
     pairs = []
     poses = np.stack([graph.variables[k].cam_from_world for k in ids])
     shared = {i: overlaps(graph, i, poses) for i in ids}
     for a, i in enumerate(ids):
-        for b, j in enumerate(ids[:a]):
+        for b, j in enumerate(ids[:a] if i >= held else ()):
             share = min(shared[i][0][b], shared[j][0][a])
             motion = max(shared[i][1][b], shared[j][1][a])
             if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION and frozenset((i, j)) not in done:
                 pairs.append((-share, j, i))
-    made = connect([(i, j) for _, i, j in sorted(pairs)[: COVISIBLE_PAIRS * len(ids)]])
+    most = COVISIBLE_PAIRS * len(graph.free_members())
+    made = connect([(i, j) for _, i, j in sorted(pairs)[:most]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made
