@@ -97,7 +97,7 @@ def write_splat(
     median_depth = float(mapper.facts["median_depth"])
     gaussians, facts = mapper.gaussians, dict(mapper.facts)
     if before is not None:
-        gaussians = with_unseen(gaussians, before, mapper.render, views)
+        gaussians = with_unseen(gaussians, before, views, NEAR_RATIO * median_depth, device)
         facts["carried"] = len(gaussians.means) - len(mapper.gaussians.means)
     with replacing(folder.path / "gaussians.ply") as ply, replacing(folder.path / "gaussians.spz") as spz:
         write_gaussians_ply(ply, gaussians)
