@@ -3,8 +3,9 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, localise.json, metric_scale.json, speed.json, stress.json, two_videos.json, and in bench/ the results.json of
-each bench under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
+live.json, localise.json, metric_scale.json, speed.json, stress.json, two_videos.json, and in bench/ the results.json
+of each bench under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside
+it.
 """
 
 from __future__ import annotations

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 HEAD = (
-    "By `python benchmarks/two_videos.py --data DATA --out {path}`: a map of some frames of a sequence, and others that "
-    "go on in it (`mastd3r run --map`). ATE of two: poses of both runs together, after one Sim(3) for all of them; of "
-    "one: a run over all frames at once. Unit of the truth, as above. Placed: images of the second video in the map's "
-    "frame; a video of another place must have none."
+    "By `python benchmarks/two_videos.py --data DATA --out {path}`: a map of some frames of a sequence, and others "
+    "that go on in it (`mastd3r run --map`). ATE of two: poses of both runs together, after one Sim(3) for all of "
+    "them; of one: a run over all frames at once. Unit of the truth, as above. Placed: images of the second video "
+    "in the map's frame; a video of another place must have none."
 )
 
 

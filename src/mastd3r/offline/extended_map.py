@@ -86,8 +86,8 @@ class ExtendedMap:
         name, found = self.saved.path.name, graph.found_at is not None
         in_map = [r for r in graph.records if r.state in MEASURED and graph.submap_of[r.kf_id] == MAP and found]
         if found:
-            said = f"in the map {name}: {len(in_map)} of {len(graph.records)} images placed, found at frame"
-            said += f" {graph.found_at} first"
+            said = f"in the map {name}: {len(in_map)} of {len(graph.records)} images placed, first found there at frame"
+            said += f" {graph.found_at}"
         else:
             said = f"{NOT_FOUND} {name}: the run is in a frame of its own"
         return {
