@@ -183,9 +183,15 @@ class RunJob:
             return
         with self.timed("map"):
             trained = train_map(
-                self.folder, self.config, cloud, views, self.tracked.map_device, self._begun, self.reporter,
+                self.folder,
+                self.config,
+                cloud,
+                views,
+                self.tracked.map_device,
+                self._begun,
+                self.reporter,
                 self.tracked.splat_before(),
-            )  # fmt: skip
+            )
         self.metrics |= trained.metrics
         if self.config.mapping.refine_poses and self.graph.started:
             self._place_frames(trained)

@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..config import Config, config_from_text
+from ..config import Config
 from ..errors import InputError
-from ..export.map_folder import SPLAT, MapKeyframe, MapRecord, read_map, write_map
+from ..export.map_folder import MapKeyframe, MapRecord, write_map
 from ..export.read_run import Run
 from ..export.run_folder import stamp
 from ..export.tracks import Tracks
 from ..geometry.se3 import inverse, transform
-from ..mapping.gaussian_arrays import GaussianArrays
-from ..mapping.ply import read_gaussians_ply, write_gaussians_ply
+from ..mapping.ply import write_gaussians_ply
 from ..parts import chosen_features, parts_of
-from ..reading.files import is_file, user_path
+from ..reading.files import user_path
 from ..types import Source, Trajectory, WorkFrame
 from .map_drawing import digest_of, drawn
 from .photographs import check_size
 from .renders import gaussians_of, lens_of
+from .saved_map import SavedMap
 from .working_eye import Look, WorkingEye, one_a_cell
 
 Array = NDArray[Any]
@@ -40,7 +40,7 @@ def save_run_as_map(run: Run, source: Source, source_path: Path, config: Config,
     before = _map_before(run)
     record = map_of(run, source, config, before)
     inputs = [run.path, source_path] if before is None else [run.path, source_path, before.path]
-    splat = before.splat() if before is not None else None
+    splat = before.gaussians if before is not None else None
     if os.path.lexists(run.path / "gaussians.ply"):
         splat = gaussians_of(run)
     elif splat is not None:
@@ -49,31 +49,18 @@ def save_run_as_map(run: Run, source: Source, source_path: Path, config: Config,
     write_map(out, record, write_splat, inputs)
 
 
-@dataclass(frozen=True)
-class MapBefore:
+def _map_before(run: Run) -> SavedMap | None:
     """The map that a run went on in."""
-
-    path: Path
-    record: MapRecord
-
-    def splat(self) -> GaussianArrays | None:
-        """Its splat, if it has one. Raises InputError where that is damaged."""
-        file = self.path / SPLAT
-        return read_gaussians_ply(file) if is_file(file) else None
-
-
-def _map_before(run: Run) -> MapBefore | None:
     facts = run.record.get("continues") or {}
     if not facts.get("found"):
         return None
-    path = user_path(str(facts.get("map") or "."), f"{run.path}/run.json continues.map")
-    record = read_map(path)
-    if digest_of(record) != facts.get("digest"):
-        raise InputError(f"{path}: expected the map that {run.path} went on in, got another one")
-    return MapBefore(path, record)
+    saved = SavedMap(user_path(str(facts.get("map") or "."), f"{run.path}/run.json continues.map"))
+    if digest_of(saved.record) != facts.get("digest"):
+        raise InputError(f"{saved.path}: expected the map that {run.path} went on in, got another one")
+    return saved
 
 
-def map_of(run: Run, source: Source, config: Config, before: MapBefore | None = None) -> MapRecord:
+def map_of(run: Run, source: Source, config: Config, before: SavedMap | None = None) -> MapRecord:
     """The same as a value."""
     lens, tracks = lens_of(run), run.tracks()
     check_size(run, source, lens)
@@ -92,8 +79,7 @@ def map_of(run: Run, source: Source, config: Config, before: MapBefore | None = 
     name, described = _described(config, eye, [look.work.gray for look in looks])
     made = [replace(kf, feature_px=d[0], descriptors=d[1]) for kf, d in zip(made, described, strict=True)]
     if before is not None:
-        own = WorkingEye(before.record.lens, config_from_text(before.record.config, f"{before.path}/config.yaml"))
-        record = drawn(before.record, own.camera, eye.camera, eye.provider)
+        record = drawn(before.record, before.eye.camera, eye.camera, eye.provider)
         known = [_in_lengths(kf, run.lengths) for kf in record.keyframes]
         if record.features != name:
             described = _described(config, eye, [kf.gray for kf in known])[1]
