@@ -3,9 +3,9 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, endless.json, corrections.json, networks.json, reference.json, masks.json,
-dense.json, live.json, localise.json, metric_scale.json, profile.json, speed.json, stress.json, and in bench/ the
-results.json of each bench under its suite's name. Plots go into a folder plots beside the page, the curve of the stress
-suite beside it.
+dense.json, live.json, localise.json, metric_scale.json, profile.json, speed.json, stress.json, two_videos.json,
+and in bench/ the results.json of each bench under its suite's name. Plots go into a folder plots beside the page, the
+curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from profile_table import profile
 from speed_table import speed
 from splats_table import splats
 from stress_table import PICTURE, stress
+from two_videos_table import two_videos
 
 COLUMNS: dict[str, tuple[str, str]] = {
     "frames_posed": ("posed", "d"),
@@ -97,6 +98,7 @@ def main() -> int:
     lines += [*speed(source.parent / "speed.json"), *profile(source.parent / "profile.json")]
     lines += live(source.parent / "live.json")
     lines += localise(source.parent / "localise.json")
+    lines += two_videos(source.parent / "two_videos.json")
     lines += [*endurance(source.parent / "endurance.json"), *endless(source.parent / "endless.json")]
     lines += reference(source.parent / "reference.json")
     lines += corrections(source.parent / "corrections.json")

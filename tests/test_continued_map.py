@@ -24,6 +24,7 @@ from mastd3r.config import HOLDOUT_EVERY, Config, config_from_yaml
 from mastd3r.errors import ConfigError
 from mastd3r.export.read_run import read_run
 from mastd3r.export.run_folder import RunFolder, stamp
+from mastd3r.mapping.gaussian_arrays import of_degree
 from mastd3r.mapping.ply import read_gaussians_ply
 from mastd3r.mapping.quality import CPU
 from mastd3r.offline import continued_map, job, map_progress, map_stage
@@ -164,7 +165,7 @@ def test_a_map_never_becomes_coarser(ended: Ended) -> None:
     kept, _, _ = continued_map.options_of(limited, 2.0, None, (160, 120), start)
     assert kept.mapping.max_gaussians == len(start.gaussians.means) and kept.mapping.minutes == 2
     assert kept.mapping.width_px == 120 and kept.mapping.iterations == STEPS
-    padded = continued_map._of_degree(start.gaussians, 2)
+    padded = of_degree(start.gaussians, 2)
     assert padded.sh_rest.shape[1:] == (8, 3) and not padded.sh_rest.any()
 
 

@@ -386,5 +386,6 @@ def test_pieces_are_not_joined_by_a_view_in_doubt(scene: Any) -> None:
     parts = SimpleNamespace(features=SimpleNamespace(alike=lambda _, others: np.full(len(others), np.nan)))
     eyes: Any = SimpleNamespace(parts=parts, relocalised=lambda *_: SimpleNamespace(), beyond_doubt=doubted)
     places: Any = SimpleNamespace(best=lambda graph, work, ids: [graph.keyframes[ids[0]]])
-    assert not join_recognised(graph, graph.latest, eyes, None, places)  # type: ignore[arg-type]
+    entry: Any = SimpleNamespace(view=lambda *_: None, open_to=lambda ids: ids)
+    assert not join_recognised(graph, graph.latest, eyes, None, places, entry)  # type: ignore[arg-type]
     assert asked == [VIEWS - 1] and graph.submap_of[VIEWS - 1] == 1

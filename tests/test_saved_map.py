@@ -14,86 +14,31 @@ import pytest
 from numpy.typing import NDArray
 
 import mastd3r
+from exact_room import HEIGHT, KEYFRAMES, LENS, QUERY, WIDTH, exact_run, room_views
 from helpers import blobs
 from made_runs import made_run
 from mastd3r.camera.opencv_lens import OpenCvLens
 from mastd3r.camera.pinhole import Camera
 from mastd3r.cli.main import main
-from mastd3r.config import Config, config_to_yaml
 from mastd3r.errors import ConfigError, InputError
-from mastd3r.export.run_folder import RunFolder
-from mastd3r.export.tracks import Tracks
 from mastd3r.geometry.se3 import inverse, so3_log, transform
 from mastd3r.mapping.gaussian_arrays import GaussianArrays
 from mastd3r.mapping.ply import write_gaussians_ply
 from mastd3r.sources import synthetic
 from mastd3r.tracking.localisation import Place, Unplaced
-from mastd3r.types import State, Trajectory
+from mastd3r.types import State
 
 Array = NDArray[Any]
-WIDTH, HEIGHT = 200, 150
-KEYFRAMES, QUERY = (0, 1, 3, 4), 2  # of frames 0.2 s apart
-SEEN_EVERY_PX = 5
-LENS = synthetic.room_camera(WIDTH, HEIGHT)
 
 
 @pytest.fixture(scope="module")
 def views() -> list[synthetic.SyntheticView]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(synthetic, "CLIP_FPS", 5.0)
-        return list(synthetic.synthetic_frames(KEYFRAMES[-1] + 1, WIDTH, HEIGHT))
+    return room_views()
 
 
 @pytest.fixture(scope="module")
 def run(views: list[synthetic.SyntheticView], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run over the made room in which everything is exact: points of every keyframe seen from all others."""
-    root = tmp_path_factory.mktemp("room")
-    (root / "photos").mkdir()
-    lines = []
-    for v in views:
-        cv2.imwrite(str(root / "photos" / f"{v.frame.index}.png"), v.frame.image[..., ::-1])
-        lines.append(f"{v.frame.timestamp_s:.6f} {v.frame.index}.png\n")
-    (root / "photos" / "rgb.txt").write_text("".join(lines))
-    folder = RunFolder(root / "run", ["mastd3r", "run"])
-    poses = np.stack([v.world_from_cam for v in views])
-    times = np.array([v.frame.timestamp_s for v in views])
-    is_keyframe = np.isin(np.arange(len(views)), KEYFRAMES)
-    folder.write_trajectory(Trajectory(times, poses, ("tracked",) * len(views), is_keyframe))
-    folder.write_camera(LENS)
-    folder.write_tracks(_exact_tracks(views, times))
-    for v in views:
-        folder.write_mask(v.frame.timestamp_s, v.moving.astype(float))
-    folder.write_config(config_to_yaml(Config()))
-    folder.update(source={"path": str(root / "photos"), "kind": "tum"})
-    folder.finish()
-    return root / "run"
-
-
-def _exact_tracks(views: list[synthetic.SyntheticView], times: Array) -> Tracks:
-    x, y = np.meshgrid(np.arange(3, WIDTH, SEEN_EVERY_PX), np.arange(3, HEIGHT, SEEN_EVERY_PX))
-    grid = np.stack([x, y], -1).reshape(-1, 2)
-    points, point, frame, px = [], [], [], []
-    for k in KEYFRAMES:
-        still = ~views[k].moving[grid[:, 1], grid[:, 0]]
-        at = grid[still]
-        depth = views[k].depth_m[at[:, 1], at[:, 0]].astype(float)
-        world = transform(views[k].world_from_cam, LENS.rays(at) * depth[:, None])
-        first = sum(map(len, points))
-        points.append(world)
-        for f in KEYFRAMES:
-            cam = transform(inverse(views[f].world_from_cam), world)
-            seen = LENS.project(np.where(cam[:, 2:] > 0.1, cam, 1.0))
-            inside = (cam[:, 2] > 0.1) & (seen >= 0).all(1) & (seen <= [WIDTH - 1, HEIGHT - 1]).all(1)
-            row = np.rint(np.where(inside[:, None], seen, 0)).astype(int)
-            inside &= np.abs(views[f].depth_m[row[:, 1], row[:, 0]] / cam[:, 2] - 1) < 0.05  # nothing stands before it
-            point.append(first + np.flatnonzero(inside))
-            frame.append(np.full(int(inside.sum()), f))
-            px.append(seen[inside])
-    world = np.concatenate(points).astype(np.float32)
-    p, f = np.concatenate(point).astype(np.int32), np.concatenate(frame).astype(np.int32)
-    order = np.lexsort((f, p))
-    colors = np.zeros((len(world), 3), np.uint8)
-    return Tracks(world, colors, times, p[order], f[order], np.concatenate(px)[order].astype(np.float32))
+    return exact_run(tmp_path_factory.mktemp("room"), views)
 
 
 @pytest.fixture(scope="module")

@@ -70,6 +70,7 @@ def reconstruct(
     config: Config | None = None,
     *,
     maps: str | Path | None = None,
+    map: str | Path | SavedMap | None = None,
     overwrite: bool = False,
     command: Sequence[str] = (),
     reporter: Reporter | None = None,
@@ -78,19 +79,23 @@ def reconstruct(
 
     source: a video, a folder of images, a sequence of a dataset, or an iterable of (seconds, image (h, w, 3) uint8
     RGB). out: the run folder; by default a temporary one, which lives as long as the result. maps: folder of
-    P(movable) maps. overwrite: an earlier run in ``out`` is removed at once, not when this one is complete; until then
-    files are in ``out``/unfinished. command and reporter: what run.json and the terminal show.
+    P(movable) maps. map: one that ``save_map`` wrote; the video goes on in its frame, lens and lengths, see
+    ``Reconstruction.continues``. overwrite: an earlier run in ``out`` is removed at once, not when this one is
+    complete; until then files are in ``out``/unfinished. command and reporter: what run.json and the terminal show.
     Raises SlamError children; what was computed until then is in the run folder, with run.log.
     """
     config, reporter = check_config(config or Config()), reporter or Silent()
+    saved = load_map(map) if isinstance(map, str | Path) else map
     if not isinstance(source, str | Path):
-        return _of_images(source, config, _Wanted(out, overwrite, command), reporter)
+        return _of_images(source, config, _Wanted(out, overwrite, command), saved, reporter)
     read = {"path": _absolute(source), "maps": None if maps is None else _absolute(maps)}
-    slam, notes = _slam_of(source, config, maps)
+    read["map"] = None if saved is None else _absolute(saved.path)
+    slam, notes = _slam_of(source, config, maps, saved)
     stopped = None if out is None or overwrite else _stopped_as(user_path(out, "out"), slam, read)
     if stopped is not None:
         return _go_on(slam, stopped, reporter)
     inputs = [user_path(p) for p in (source, maps) if p is not None]
+    inputs += [] if saved is None else [saved.path]
     inputs += [] if slam.scale is None else slam.scale.inputs
     folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
     with folder:
@@ -120,7 +125,8 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
     read = record.get("source") or {}
     if not os.path.lexists(stopped / "config.yaml") or not read.get("path"):
         raise InputError(f"{stopped}: expected config.yaml and source.path in run.json, got a run stopped before them")
-    slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"))
+    saved = load_map(read["map"]) if read.get("map") else None
+    slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"), saved)
     return _go_on(slam, stopped, reporter or Silent())
 
 
@@ -224,7 +230,9 @@ def material_for_map(source: str | Path, out: Path, config: Config) -> MapMateri
         return job.smooth_masks(slam.masks.filter.appearance)
 
 
-def _slam_of(path: str | Path, config: Config, maps: str | Path | None) -> tuple[Slam, list[str]]:
+def _slam_of(
+    path: str | Path, config: Config, maps: str | Path | None, saved: SavedMap | None = None
+) -> tuple[Slam, list[str]]:
     source = open_source(
         path,
         config.source,
@@ -233,7 +241,7 @@ def _slam_of(path: str | Path, config: Config, maps: str | Path | None) -> tuple
         semantic_dir=None if maps is None else user_path(maps),
     )
     config, notes = with_dataset_lens(replace(config, scale=absolute(config.scale)), source)
-    return Slam(config, source.size, source=source), notes
+    return Slam(config, source.size, source=source, map=saved), notes
 
 
 @dataclass(frozen=True)
@@ -268,15 +276,16 @@ def _track(slam: Slam, job: RunJob, known: int = 0) -> None:
 
 
 def _of_images(
-    images: Iterable[tuple[float, Array]], config: Config, wanted: _Wanted, reporter: Reporter
+    images: Iterable[tuple[float, Array]], config: Config, wanted: _Wanted, saved: SavedMap | None, reporter: Reporter
 ) -> Reconstruction:
     rest: Iterator[tuple[float, Array]] = iter(images)
     first = next(rest, None)
     if first is None:
         raise InputError("reconstruct: expected images, got none")
     height, width = np.shape(first[1])[:2] if np.ndim(first[1]) == 3 else (0, 0)
-    slam = Slam(config, (width, height))
-    folder, temporary = _folder(wanted, [] if slam.scale is None else slam.scale.inputs)
+    slam = Slam(config, (width, height), map=saved)
+    inputs = [] if slam.scale is None else slam.scale.inputs
+    folder, temporary = _folder(wanted, inputs if saved is None else [*inputs, saved.path])
     with folder, slam.job(folder, reporter) as job:
         with job.timed("tracking"), job.reporter.stage("tracking", None, "frames") as bar:
             for time_s, image in chain([first], rest):

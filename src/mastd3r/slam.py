@@ -26,8 +26,10 @@ from .graph.keyframe_graph import KeyframeGraph
 from .graph.passages import retake_passages
 from .metric.measure import measure
 from .offline.checkpoints import Checkpoints, Memory
+from .offline.extended_map import ExtendedMap
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
+from .offline.saved_map import SavedMap
 from .offline.tracked import Tracked
 from .parts import Parts, build_parts, chosen_map_device, with_map_effort
 from .progress import Reporter, Silent
@@ -80,14 +82,18 @@ class Slam:
         source: Source | None = None,
         parts: Parts | None = None,
         live: bool = False,
+        map: SavedMap | None = None,
     ) -> None:
         """``size`` (width, height) of the images. ``source``: what the frames come from, if it can be read again.
 
         Without one, frames are kept on disk until ``finish``. ``parts``: instead of those that the options name.
         ``live``: no frame waits for keyframes or the start of the map; results then depend on the machine's speed.
-        Raises ConfigError and InputError for options that this machine or source cannot serve.
+        ``map``: the frames go on in it; those whose poses are in its frame have ``submap`` 0.
+        Raises ConfigError and InputError for options that this machine, source or map cannot serve.
         """
         self.config = check_config(config or Config())
+        if live and map is not None:
+            raise ConfigError("live: expected no map to go on in, which run alone does")
         if live and self.config.scale:
             raise ConfigError(
                 "live: expected no scale, as poses are given out before it is known; measure it afterwards"
@@ -96,12 +102,19 @@ class Slam:
         given = self.config.camera.intrinsics
         self.recorded = None if source is not None else _recorded(self.config, size)
         self.source: Source = source if source is not None else self.recorded  # type: ignore[assignment]
-        self.rectifier = rectifier_for(given, self.source.size)
+        self.extends = None if map is None else ExtendedMap(map)
+        if self.extends is not None:
+            self.config = self.extends.options(self.config, self.source)
+        of_map = None if self.extends is None or given else self.extends
+        self.rectifier = rectifier_for(given, self.source.size) if of_map is None else of_map.rectifier(self.source)
         self.seen = self.source if self.rectifier is None else RectifiedSource(self.source, self.rectifier)
         self.parts = parts if parts is not None else build_parts(self.config, self.seen)
         self.map_device = chosen_map_device(self.config.mapping, self.parts.notes)
         self.config = with_map_effort(self.config, self.source.size, self.map_device, self.parts.notes)
-        self.graph = _empty_graph(self.config, self.parts, self.rectifier, self.seen)
+        known = (self.config, self.parts, self.rectifier)
+        self.graph = _empty_graph(*known, self.seen) if of_map is None else of_map.graph(*known, self.source)
+        if self.extends is not None:
+            self.extends.begin(self.graph, self.config, self.parts)
         self.two_view = TwoViewEstimator(self.config, self.parts, self.graph)
         keyframes = LiveKeyframes if live else Keyframes
         self.keyframes: Keyframes = keyframes(self.config, self.parts, self.graph, self.two_view)
@@ -217,7 +230,8 @@ class Slam:
 
     def job(self, folder: RunFolder, reporter: Reporter | None = None, *, checkpoints: bool = False) -> RunJob:
         """What writes this run into a folder; with checkpoints, if the frames can be read again."""
-        tracked = Tracked(self.source, self.config, self.graph, self.parts, self.rectifier, self.map_device, self.scale)
+        how = (self.rectifier, self.map_device, self.scale, self.extends)
+        tracked = Tracked(self.source, self.config, self.graph, self.parts, *how)
         if checkpoints and not can_remember(self.masks):
             folder.note("no checkpoints: the filter of the mask does not say what it remembers")
             checkpoints = False

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
-import os
 import pkgutil
 import shutil
 import sys
@@ -16,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import miniatures
-from fuzz import kinds_download, kinds_runs, kinds_sources, kinds_words  # noqa: F401  they register themselves
+from fuzz import kinds_download, kinds_maps, kinds_runs, kinds_sources, kinds_words  # noqa: F401  they register themselves
 from fuzz.case import KINDS, planned
 from fuzz.harness import FAULTS, Outcome, run_case
-from fuzz.material import Shared
+from fuzz.material import Shared, aside, in_a_child
 
 
 def warm() -> None:
@@ -41,30 +40,20 @@ def compile_kernels(root: Path, shared: Shared) -> None:
         in_a_child(["export", str(shared.run), "--to", name.partition(".")[0], "--out", str(root / f"good-{name}")])
     in_a_child(["map", str(shutil.copytree(shared.run, root / "copy")), "--minutes", "0.001"])
     in_a_child(["eval", str(shared.run), str(shared.run.parent / "photos")])
-
-
-def in_a_child(words: list[str]) -> None:
-    """One command in a process of its own, whatever comes of it."""
-    pid = os.fork()
-    if pid:
-        os.waitpid(pid, 0)
-        return
-    from mastd3r.cli.main import main as command
-
-    for number in (1, 2):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
-    try:
-        os._exit(command(words))
-    finally:
-        os._exit(1)
+    photos = str(shared.run.parent / "photos")
+    in_a_child(["localise", str(shared.map), photos, "--out", str(root / "good-places")])
+    in_a_child(["run", photos, "--map", str(shared.map), "--no-map", "--out", str(root / "good-in-map")])
 
 
 def room_clip(folder: Path) -> Path:
     """A short clip in which everything can be tracked."""
     from mastd3r.sources import synthetic
 
-    synthetic.CLIP_FPS = 5.0
-    synthetic.make_room_clip(folder, frames=24, width=160, height=120)
+    def make() -> None:
+        synthetic.CLIP_FPS = 5.0
+        synthetic.make_room_clip(folder, frames=24, width=160, height=120)
+
+    aside(make)
     return folder
 
 

@@ -86,12 +86,13 @@ def records(rng: random.Random, room: Room, shared: Shared) -> Case:
     for name in rng.sample(("run.json", "camera.json", "metrics.json"), rng.choice((1, 1, 2))):
         data: Any = json.loads((run / name).read_text())
         for _ in range(rng.choice((1, 1, 3))):
-            _replace_somewhere(rng, data)
+            replace_somewhere(rng, data)
         (run / name).write_text(json.dumps(data if rng.random() < 0.95 else rng.choice(VALUES)))
     return Case(commands_on(rng, run, room, shared), _no_browser)
 
 
-def _replace_somewhere(rng: random.Random, data: Any) -> None:
+def replace_somewhere(rng: random.Random, data: Any) -> None:
+    """Another value in the place of one in an object or list, at any depth."""
     while True:
         keys = list(data) if isinstance(data, dict) else list(range(len(data)))
         if not keys:

@@ -147,6 +147,20 @@ class Shared:
         return made.path
 
     @cached_property
+    def map(self) -> Path:
+        """A saved map of that run."""
+        in_a_child(["save", str(self.run), "--map", str(self.root / "map")])
+        return self.root / "map"
+
+    @cached_property
+    def map_digest(self) -> str:
+        """What a run that went on in that map says of it."""
+        from mastd3r.export.map_folder import read_map
+        from mastd3r.offline.map_drawing import digest_of
+
+        return digest_of(read_map(self.map))
+
+    @cached_property
     def video(self) -> bytes:
         return write_video(self.root / "v.mp4", blobs(8)).read_bytes()
 
@@ -158,6 +172,28 @@ class Shared:
             Image.fromarray(blobs(1)[0]).save(self.root / f"p.{suffix}")
             out.append((self.root / f"p.{suffix}").read_bytes())
         return out
+
+
+def aside(make: Callable[[], object]) -> None:
+    """Call it in a process of its own, whatever comes of it: threads that it starts here would be dead in every fork,
+    and be waited for there."""
+    pid = os.fork()
+    if pid:
+        os.waitpid(pid, 0)
+        return
+    for number in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+    try:
+        make()
+    finally:
+        os._exit(0)
+
+
+def in_a_child(words: list[str]) -> None:
+    """One command in a process of its own, whatever comes of it."""
+    from mastd3r.cli.main import main as command
+
+    aside(lambda: command(words))
 
 
 def garbled(rng: random.Random, data: bytes) -> bytes:

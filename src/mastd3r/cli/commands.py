@@ -91,6 +91,7 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
         args.out,
         config,
         maps=getattr(args, "maps", None),
+        map=getattr(args, "map", None),
         overwrite=args.overwrite,
         command=args.words,
         reporter=reporter_of(args, console),
@@ -101,6 +102,8 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
 
 def show(result: Reconstruction) -> None:
     """What came of a run."""
+    if result.continues:
+        screen().print(result.continues["said"], style="bold", soft_wrap=True, markup=False)
     if result.observability.get("said"):
         screen().print(result.observability["said"], style="bold", soft_wrap=True, markup=False)
     screen().print(_table(result.metrics))

@@ -157,6 +157,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
     p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
+    p.add_argument("--map", type=path, help="go on in a map of mastd3r save: its frame, its lens, its lengths")
     p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")

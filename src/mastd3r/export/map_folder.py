@@ -47,6 +47,7 @@ class MapKeyframe:
     depth_info: Array  # (p,) float64, 1/variance of it in units of a pixel's noise; 0: its depth is not known
     feature_px: Array  # (f, 2) float32; f = 0 where no features are kept
     descriptors: Array  # (f, c) float16, of unit length
+    color: Array  # (p, 3) uint8 RGB of the points; (0, 3) where they are not kept
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,9 @@ ARRAYS = {  # type, shape
     "depth_info": ("<f8", ("p",)),
     "feature_px": ("<f4", ("f", 2)),
     "descriptors": ("<f2", ("f", "c")),
+    "color": ("|u1", ("q", 3)),
 }
+LATER = {"color": np.zeros((0, 3), np.uint8)}  # what maps lack that were saved before it was kept
 
 
 def write_map(out: Path, record: MapRecord, write_splat: Callable[[Path], None] | None, inputs: Sequence[Path]) -> None:
@@ -175,7 +178,8 @@ def _keyframe(folder: Path, n: int, row: Any, size: tuple[int, int], grid: tuple
         raise InputError(f"{where}: expected timestamp_s and world_from_cam, got {short(repr(row))}")
     pose = _pose(row.get("world_from_cam"), where)
     path = folder / _name(n)
-    found = arrays_of(path, {name: kind for name, (kind, _) in ARRAYS.items()}, "a keyframe of a saved map")
+    kinds = {name: kind for name, (kind, _) in ARRAYS.items()}
+    found = LATER | arrays_of(path, kinds, "a keyframe of a saved map", LATER)
     sides: dict[str, int] = {"w": size[0], "h": size[1], "p": math.prod(grid)}
     for name, (_, shape) in ARRAYS.items():
         got = found[name].shape
@@ -184,6 +188,8 @@ def _keyframe(folder: Path, n: int, row: Any, size: tuple[int, int], grid: tuple
         )
         if got != wanted:
             raise InputError(f"{path} {name}: expected shape {wanted}, got {got}")
+    if sides["q"] not in (0, sides["p"]):
+        raise InputError(f"{path} color: expected one of each of {sides['p']} points, got {sides['q']}")
     if not all(np.isfinite(a).all() for a in found.values()):
         raise InputError(f"{path}: expected finite numbers, got some that are not")
     inside = (found["px"] >= -0.5).all() and (found["px"] <= np.array(size) - 0.5).all()

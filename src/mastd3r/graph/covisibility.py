@@ -54,10 +54,16 @@ def overlaps(graph: KeyframeGraph, i: int, cam_from_world: Array) -> tuple[Array
 
 
 def covisible(graph: KeyframeGraph, kf_id: int, before: int, most: int, min_overlap: float) -> list[int]:
-    """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours."""
+    """Keyframes older than ``before`` that see what kf_id sees, least image motion first, no two neighbours.
+
+    All of a saved map are older; the one that kf_id was tracked from is connected already.
+    """
     pose = graph.variables[kf_id].cam_from_world
     found = []
-    for k in nearby(graph, [k for k in graph.members() if k < before], pose):
+    older = [k for k in graph.members() if k < max(before, graph.held)]
+    for k in nearby(graph, older, pose):
+        if k < graph.held and graph.connected(k, kf_id):
+            continue
         share, motion = overlap(graph, k, pose)
         if share >= min_overlap and motion < 0.5:
             found.append((motion, k))

@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..types import USABLE_WEIGHT, Matches
+
 Array = NDArray[Any]
+KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
 @dataclass
@@ -40,3 +43,15 @@ class KeyframeVariables:
 
 Variables = dict[int, KeyframeVariables]  # by keyframe
 Factors = dict[int, list[ReprojectionFactor]]  # by anchor keyframe
+
+
+def strongest(matches: Matches, weight: Array) -> tuple[Array, Array, Array]:
+    """Points, targets and weights of the matches that a frame keeps."""
+    strong = np.flatnonzero(weight > USABLE_WEIGHT)
+    keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
+    return keep, matches.new_px[keep].astype(np.float32), weight[keep].astype(np.float32)
+
+
+def no_matches() -> tuple[Array, Array, Array]:
+    """The same of a frame that keeps none."""
+    return np.zeros(0, int), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)

@@ -59,7 +59,7 @@ def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
     turns: set[tuple[int, int]] = set()
     if whole.started:
         graph.set_intrinsics(as_given(whole.intrinsics))
-    else:
+    if not whole.started - ({0} if whole.held else set()):
         seen, pairs = observed(graph, graph.members()[-LOOKED_AT:])
         if seen.kind in ("none", "rotation"):
             log.info("no start: the image motion is that of a camera %s", WITHOUT_PARALLAX[seen.kind])

@@ -30,6 +30,7 @@ class Intrinsics:
         return np.isfinite(self.prior_info)
 
 
+FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
 PRIOR_FOCAL_RATIO, PRIOR_FOCAL_SIGMA = 1.0, 0.25  # focal / sqrt(width * height) of most cameras; 1 sigma of its log
 EXIF_FOCAL_SIGMA = 0.05  # of its log, where EXIF tells it: equivalents are in whole mm, lenses focus and are corrected
 PRIOR_RADIAL_SIGMA = (0.05, 0.1, 0.1)  # of k, m, n
@@ -41,6 +42,28 @@ PRIOR_GAIN = 10.0  # match errors are alike within a view, so their sum claims t
 def as_given(intrinsics: Intrinsics) -> Intrinsics:
     """The same, as known as if they had been given."""
     return Intrinsics(intrinsics.values, intrinsics.values, np.full(N_GLOBAL, np.inf))
+
+
+def of_camera(camera: Camera) -> Intrinsics:
+    """Those of a camera at working size, as given; fx and fy are joined by their geometric mean."""
+    focal = float(np.sqrt(camera.fx_px * camera.fy_px))
+    k, m, n = inverse_radial(focal, (camera.k1, camera.k2, camera.k3), (camera.width, camera.height))
+    values = np.array([np.log(focal), k, camera.cx_px, camera.cy_px, m, n])
+    return Intrinsics(values, values.copy(), np.full(N_GLOBAL, np.inf), "given")
+
+
+def believing(intrinsics: Intrinsics, focal_px: float | None, size: tuple[int, int]) -> Intrinsics:
+    """The same, starting at a focal length in pixels of ``size``, where a camera may have it.
+
+    What EXIF says goes before it.
+    """
+    low, high = FOCAL_RATIOS_BELIEVED
+    if intrinsics.focal_source == "EXIF":
+        return intrinsics
+    if focal_px is None or not low < focal_px / np.sqrt(size[0] * size[1]) < high:
+        return intrinsics
+    values = np.concatenate([[np.log(focal_px)], intrinsics.values[1:]])
+    return Intrinsics(values, values.copy(), intrinsics.prior_info)
 
 
 def camera_of(intrinsics: Intrinsics, size: tuple[int, int]) -> Camera:

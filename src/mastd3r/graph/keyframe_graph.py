@@ -19,13 +19,11 @@ from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from ..types import USABLE_WEIGHT, Matches, State, WorkFrame
 from .bundle_adjustment import SolveReport, solve
-from .factors import KeyframeVariables, ReprojectionFactor
-from .intrinsics import Intrinsics, camera_of
+from .factors import KeyframeVariables, ReprojectionFactor, no_matches, strongest
+from .intrinsics import Intrinsics, believing, camera_of
 from .windows import Window, depths_of, everything, sliding
 
 Array = NDArray[Any]
-FOCAL_RATIOS_BELIEVED = (0.35, 4.0)  # focal / sqrt(width * height) of a network's points, for the lens to start there
-KEPT_MATCHES = 600  # matches kept of a frame that is no keyframe, for the final pose
 
 
 @dataclass(frozen=True)
@@ -66,6 +64,8 @@ class KeyframeGraph:
         self.submap = 0  # the one being tracked
         self.submap_of: dict[int, int] = {}
         self.started: set[int] = set()  # submaps that have poses and depths
+        self.held = 0  # keyframes of a saved map, the first: their poses stay, and their submap is 0
+        self.found_at: int | None = None  # frame at which the video was found in that map
         self.last_report: SolveReport | None = None
         self.loops: list[tuple[int, int, str]] = []  # two frames that may show one place, and what came of it
 
@@ -90,6 +90,10 @@ class KeyframeGraph:
         """The first keyframe of every submap: they do not move."""
         return sorted({s: k for k, s in sorted(self.submap_of.items(), reverse=True)}.values())
 
+    def free_members(self) -> list[int]:
+        """The same as ``members``, without the keyframes of a saved map."""
+        return [k for k in self.members() if k >= self.held]
+
     def camera(self) -> Camera:
         """The camera at working size."""
         return camera_of(self.intrinsics, self.size)
@@ -112,7 +116,7 @@ class KeyframeGraph:
     @property
     def depths_measured(self) -> bool:
         """True where depths have strong priors: the scale is theirs."""
-        first = [self.variables[k] for k in sorted(self.variables)[:3]]
+        first = [self.variables[k] for k in sorted(self.variables) if k >= self.held][:3]
         return any((v.prior_info * v.inv_depth**2 > 25).mean() > 0.1 for v in first)
 
     def connected(self, i: int, j: int) -> bool:
@@ -131,17 +135,8 @@ class KeyframeGraph:
     # -- growing and shrinking -------------------------------------------------------------------------------
 
     def believe_focal(self, focal_px: float | None) -> None:
-        """Start the lens at a focal length that a frame's own points speak of, where a camera may have it.
-
-        What EXIF says goes before it.
-        """
-        low, high = FOCAL_RATIOS_BELIEVED
-        if self.intrinsics.focal_source == "EXIF":
-            return
-        if focal_px is None or not low < focal_px / np.sqrt(self.size[0] * self.size[1]) < high:
-            return
-        values = np.concatenate([[np.log(focal_px)], self.intrinsics.values[1:]])
-        self.intrinsics = Intrinsics(values, values.copy(), self.intrinsics.prior_info)
+        """Start the lens at a focal length that a frame's own points speak of, where a camera may have it."""
+        self.intrinsics = believing(self.intrinsics, focal_px, self.size)
 
     def add_keyframe(
         self,
@@ -190,7 +185,7 @@ class KeyframeGraph:
         weight: Array,
     ) -> FrameRecord:
         """Store a frame's place; its strongest matches are kept for the final pose."""
-        kept = _nothing() if matches is None else _strongest(matches, weight)
+        kept = no_matches() if matches is None else strongest(matches, weight)
         entry = FrameRecord(work.index, work.timestamp_s, kf_id, cam_from_kf, state, *kept)
         self.records.append(entry)
         return entry
@@ -198,13 +193,13 @@ class KeyframeGraph:
     def place(self, record: FrameRecord, kf_id: int, cam_from_kf: Array, matches: Matches, weight: Array) -> None:
         """A frame that was lost has been found: (4, 4) relative to keyframe ``kf_id``, by ``matches`` with it."""
         record.kf_id, record.cam_from_kf, record.state = kf_id, cam_from_kf, "tracked"
-        record.points, record.target, record.weight = _strongest(matches, weight)
+        record.points, record.target, record.weight = strongest(matches, weight)
 
     def replace_last_by_keyframe(self, kf: Keyframe) -> None:
         """The frame recorded last has become keyframe ``kf``."""
         last = self.records[-1]
         self.records[-1] = FrameRecord(
-            last.index, last.timestamp_s, kf.id, np.eye(4), last.state, *_nothing(), is_keyframe=True
+            last.index, last.timestamp_s, kf.id, np.eye(4), last.state, *no_matches(), is_keyframe=True
         )
 
     def start_submap(self) -> None:
@@ -222,7 +217,7 @@ class KeyframeGraph:
         for r in self.records:
             if r.kf_id in gone:
                 r.state, r.is_keyframe, r.kf_id = "lost", False, max(len(self.keyframes) - 1, 0)
-                r.points, r.target, r.weight = _nothing()
+                r.points, r.target, r.weight = no_matches()
         self.started.discard(self.submap)
 
     def part(self) -> KeyframeGraph:
@@ -249,6 +244,28 @@ class KeyframeGraph:
         if len(aside.keyframes) != len(self.keyframes):
             raise ValueError(f"take: expected a copy of {len(self.keyframes)} keyframes, got {len(aside.keyframes)}")
         self.edges, self.variables, self.intrinsics = aside.edges, aside.variables, aside.intrinsics
+
+    def hold(self) -> None:
+        """The keyframes that are there are those of a saved map."""
+        self.held = len(self.keyframes)
+        self.started.add(self.submap)
+
+    def found_in_map(self, index: int) -> None:
+        """The video has been found in the saved map, at this frame for the first time."""
+        self.found_at = index if self.found_at is None else self.found_at
+
+    def leave_map_unless_found(self) -> None:
+        """Without the saved map, where nothing was found in it: as if it had never been there, but for the lens."""
+        gone, self.held = self.held, self.held if self.found_at is not None else 0
+        if self.held == gone:
+            return
+        self.keyframes = [replace(kf, id=kf.id - gone) for kf in self.keyframes[gone:]]
+        self.variables = {k - gone: v for k, v in self.variables.items() if k >= gone}
+        self.submap_of = {k - gone: s for k, s in self.submap_of.items() if k >= gone}
+        self.edges = [replace(e, i=e.i - gone, j=e.j - gone) for e in self.edges if min(e.i, e.j) >= gone]
+        for r in self.records:
+            r.kf_id = max(r.kf_id - gone, 0)
+        self.started.discard(0)
 
     def become(self, other: KeyframeGraph) -> None:
         """Hold what another graph holds: one that was written down earlier."""
@@ -313,9 +330,9 @@ class KeyframeGraph:
     def normalise(self) -> None:
         """Monocular scale is free: keep the median inverse depth of the first three keyframes at one.
 
-        Where depths are measured (strong priors) the scale is theirs and nothing is done.
+        Where depths are measured (strong priors), or in a saved map, the scale is theirs and nothing is done.
         """
-        if self.depths_measured:
+        if self.held or self.depths_measured:
             return
         m = float(np.median([self.median_inv_depth(k) for k in sorted(self.variables)[:3]]))
         if not np.isfinite(m) or m <= 0:
@@ -373,7 +390,7 @@ class KeyframeGraph:
     @property
     def window_is_all(self) -> bool:
         """True while the sliding window holds every keyframe of the submap being tracked."""
-        return len(self.members()) <= self.config.window
+        return len(self.free_members()) <= self.config.window
 
     def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
         """Every keyframe moves but the first of each submap."""
@@ -381,14 +398,3 @@ class KeyframeGraph:
         self.normalise()
         self.last_report = report
         return report
-
-
-def _strongest(matches: Matches, weight: Array) -> tuple[Array, Array, Array]:
-    """Points, targets and weights of the matches that a frame keeps."""
-    strong = np.flatnonzero(weight > USABLE_WEIGHT)
-    keep = np.sort(strong[np.argsort(-weight[strong], kind="stable")[:KEPT_MATCHES]])
-    return keep, matches.new_px[keep].astype(np.float32), weight[keep].astype(np.float32)
-
-
-def _nothing() -> tuple[Array, Array, Array]:
-    return np.zeros(0, int), np.zeros((0, 2), np.float32), np.zeros(0, np.float32)

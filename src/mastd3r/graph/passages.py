@@ -69,7 +69,7 @@ def doubtful_passages(graph: KeyframeGraph, times: float = DOUBTFUL) -> list[lis
 
     None where depths are measured: their scale is not ours to change, and a passage by itself does not know it.
     """
-    ids = graph.members()
+    ids = graph.free_members()
     if len(ids) < 2 * LENGTH or graph.depths_measured:
         return []
     firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]
@@ -183,7 +183,8 @@ def _cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
         return [graph.solve_all(iterations, kernel_px) for kernel_px, iterations in WHOLE][-1].cost_last
     first, last = members.index(ids[0]), members.index(ids[-1])
     around = members[max(first - AROUND, 0) : last + AROUND + 1]
-    window = Window(around, graph.edges_among(around), frozenset(around[:1]), ALL_INTRINSICS)
+    still = frozenset([around[0], *(k for k in around if k < graph.held)])
+    window = Window(around, graph.edges_among(around), still, ALL_INTRINSICS)
     old_end = graph.variables[around[-1]].cam_from_world
     cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in WHOLE][-1].cost_last
     moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end

@@ -42,7 +42,9 @@ class _Edge:
 
 
 def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
-    """Sim(3) pose-graph optimisation of the submap being tracked, so that the loops close. Its first keyframe stays.
+    """Sim(3) pose-graph optimisation of the submap being tracked, so that the loops close.
+
+    Its first keyframe stays, and a saved map.
 
     The edges are the pairs that matches connect, with their present relative poses, and the loops. An edge counts by
     the square of its matches, since one that had few was also at the limit of what can be followed: drift goes there.
@@ -54,7 +56,8 @@ def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
     ids = graph.members()
     row = {k: n for n, k in enumerate(ids)}
     edges = _present_edges(graph, row) + [_loop_edge(x, row) for x in loops]
-    factor = np.exp(_log_factors(len(ids), edges))
+    still = max(1, len(ids) - len(graph.free_members()))  # rows: the first
+    factor = np.exp(_log_factors(len(ids), still, edges))
     for k, n in row.items():
         graph.scale_keyframes([k], float(factor[n]))
     for n, edge in enumerate(edges):
@@ -63,7 +66,9 @@ def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
         pose[:3, 3] *= factor[edge.i] if edge.is_loop else np.sqrt(factor[edge.i] * factor[edge.j])
         edges[n] = replace(edge, j_from_i=pose)
     depth = 1 / np.median([graph.median_inv_depth(k) for k in ids])
-    poses = _solve_poses(_chained(graph.variables[ids[0]].cam_from_world, len(ids), edges), edges, float(depth))
+    start = _chained(graph.variables[ids[0]].cam_from_world, len(ids), edges)
+    start[:still] = [graph.variables[k].cam_from_world for k in ids[:still]]
+    poses = _solve_poses(start, still, edges, float(depth))
     for k, n in row.items():
         graph.set_keyframe_pose(k, poses[n])
 
@@ -86,15 +91,17 @@ def _present_edges(graph: KeyframeGraph, row: dict[int, int]) -> list[_Edge]:
     return [_Edge(row[i], row[j], poses[j] @ inverse(poses[i]), 0.0, w**2) for (i, j), w in seen.items()]
 
 
-def _log_factors(n: int, edges: list[_Edge]) -> Array:
-    """(n,) log of every keyframe's factor; the first one's is 0."""
+def _log_factors(n: int, still: int, edges: list[_Edge]) -> Array:
+    """(n,) log of every keyframe's factor; those of the first ``still`` are 0."""
+    if still == n:
+        return np.zeros(n)
     i, j = np.array([x.i for x in edges]), np.array([x.j for x in edges])
     weight = np.array([x.weight for x in edges]) / np.mean([x.weight for x in edges])
     wanted = weight * np.array([x.log_scale for x in edges])
     rows, ones = np.arange(len(edges)), np.ones(len(edges))
     jac = csr_array(coo_array((np.r_[ones, -ones], (np.r_[rows, rows], np.r_[j, i])), shape=(len(edges), n)))
-    hess = (jac.T @ diags_array(weight) @ jac)[1:, 1:] + 1e-9 * diags_array(np.ones(n - 1))
-    return np.r_[0.0, np.atleast_1d(spsolve(hess.tocsc(), (jac.T @ wanted)[1:]))]
+    hess = (jac.T @ diags_array(weight) @ jac)[still:, still:] + 1e-9 * diags_array(np.ones(n - still))
+    return np.r_[np.zeros(still), np.atleast_1d(spsolve(hess.tocsc(), (jac.T @ wanted)[still:]))]
 
 
 def _chained(first: Array, n: int, edges: list[_Edge]) -> list[Array]:
@@ -110,9 +117,14 @@ def _chained(first: Array, n: int, edges: list[_Edge]) -> list[Array]:
     return poses
 
 
-def _solve_poses(poses: list[Array], edges: list[_Edge], depth: float) -> list[Array]:
-    """Gauss-Newton on the edges; a translation of the scene's depth counts like a turn of one radian."""
-    n = len(poses)
+def _solve_poses(poses: list[Array], still: int, edges: list[_Edge], depth: float) -> list[Array]:
+    """Gauss-Newton on the edges, the first ``still`` poses held.
+
+    A translation of the scene's depth counts like a turn of one radian.
+    """
+    n, first = len(poses), 6 * still
+    if still == n:
+        return poses
     unit = np.r_[np.full(3, 1 / depth), np.ones(3)] ** 2
     mean = np.mean([x.weight for x in edges])
     for _ in range(ITERATIONS):
@@ -130,8 +142,8 @@ def _solve_poses(poses: list[Array], edges: list[_Edge], depth: float) -> list[A
                     cols.append(c.ravel())
                     values.append((jac_a.T @ (w[:, None] * jac_b)).ravel())
         hess = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(6 * n, 6 * n))
-        inner = csr_array(hess)[6:, 6:] + 1e-9 * diags_array(np.ones(6 * n - 6))
-        step = np.r_[np.zeros(6), spsolve(inner.tocsc(), rhs[6:])]
+        inner = csr_array(hess)[first:, first:] + 1e-9 * diags_array(np.ones(6 * n - first))
+        step = np.r_[np.zeros(first), spsolve(inner.tocsc(), rhs[first:])]
         poses = [se3_exp(step[6 * k : 6 * k + 6]) @ p for k, p in enumerate(poses)]
         if np.abs(step).max() < 1e-7:
             break

@@ -43,11 +43,15 @@ def with_scale(graph: KeyframeGraph, i: int, j: int, j_from_i: Array, matches: M
 
 
 def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> None:
-    """Bring j's submap into the world of i's; they are one from here on.
+    """Bring j's submap into the world of i's; they are one from here on. A saved map stays where it is.
 
     ``j_from_i``: from points of camera i, in the lengths of its submap, to those of camera j in the lengths of its own.
     """
+    if graph.held and graph.submap_of[j] == 0:
+        return join(graph, j, i, j_from_i.inverse())
     keep, gone = graph.submap_of[i], graph.submap_of[j]
+    if graph.held and keep == 0:
+        graph.found_in_map(graph.records[-1].index)
     cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (i, j))
     moved = graph.members(gone)
     graph.transform_keyframes(moved, cam_i.inverse() @ j_from_i.inverse() @ cam_j)
@@ -68,18 +72,22 @@ def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
     for submap in sorted(set(graph.submap_of.values()))[1:]:
         ids = set(graph.members(submap))
         own = [n for n, r in enumerate(graph.records) if r.kf_id in ids and r.state != "lost"]
-        before = [r for r in graph.records[: own[0]] if r.kf_id not in ids and r.state != "lost"]
         for n in own:
             graph.set_record_state(graph.records[n], "interpolated")
         out.append((graph.records[own[0]].index, graph.records[own[-1]].index))
-        if not before:
+        rest = [r for r in graph.records[: own[0]] if r.kf_id not in ids and r.state != "lost"]
+        end = graph.records[own[0]]
+        if not rest:  # the video began outside of a saved map: back from where it was found there
+            rest = [r for r in reversed(graph.records[own[-1] + 1 :]) if r.kf_id not in ids and r.state != "lost"]
+            end = graph.records[own[-1]]
+        if not rest:
             continue
-        first, last, past = graph.records[own[0]], before[-1], before[-min(len(before), VELOCITY_FRAMES)]
-        now, then = (r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world for r in (last, past))
-        span_s = max(last.timestamp_s - past.timestamp_s, 1e-9)
-        ahead = min((first.timestamp_s - last.timestamp_s) / span_s, MOST_AHEAD)
+        near, past = rest[-1], rest[-min(len(rest), VELOCITY_FRAMES)]
+        now, then = (r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world for r in (near, past))
+        span_s = max(abs(near.timestamp_s - past.timestamp_s), 1e-9)
+        ahead = min(abs(end.timestamp_s - near.timestamp_s) / span_s, MOST_AHEAD)
         guess = se3_exp(ahead * se3_log(now @ inverse(then))) @ now
-        i, j = last.kf_id, first.kf_id
+        i, j = near.kf_id, end.kf_id
         j_from_i = Sim3.from_rigid(guess @ inverse(graph.variables[i].cam_from_world))
         join(graph, i, j, j_from_i.in_lengths(graph.median_inv_depth(i) / graph.median_inv_depth(j)))
     return out

@@ -35,13 +35,19 @@ class Window:
 
 
 def sliding(graph: KeyframeGraph) -> tuple[Window, bool]:
-    """The last ``window`` keyframes and what they are matched with, which holds them; True where that is all."""
-    ids, size = graph.members(), graph.config.window
+    """The last ``window`` keyframes and what they are matched with, which holds them; True where that is all.
+
+    What a saved map sees of them holds them too: its depths are known.
+    """
+    ids, size = graph.free_members(), graph.config.window
     n, active = len(ids), set(ids[-size:])
-    edges = [e for e in graph.edges if e.i in active]
-    near = active | {e.j for e in edges}
+    edges = [e for e in graph.edges if e.i in active or (e.i < graph.held and e.j in active)]
+    near = active | {k for e in edges for k in (e.i, e.j)}
     whole = len(near) == n and n <= size
-    fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
+    if n <= size and near - active:
+        fixed = frozenset(near - active)
+    else:
+        fixed = frozenset(ids[:1]) if whole else frozenset((near - active) | {min(active)})
     moves = n <= 2 * size or n % 4 == 0
     early = RADIAL if len(graph.keyframes) < graph.config.radial_keyframes else ()
     return Window(sorted(near), edges, fixed, _held(graph, early if moves else ALL_INTRINSICS)), whole
@@ -55,8 +61,9 @@ def depths_of(graph: KeyframeGraph, kf_id: int) -> Window:
 
 
 def everything(graph: KeyframeGraph) -> Window:
-    """Every keyframe; the first of each submap stays."""
-    return Window(graph.variables.keys(), graph.edges, frozenset(graph.roots()), _held(graph, ()))
+    """Every keyframe; the first of each submap stays, and a saved map."""
+    still = frozenset([*graph.roots(), *range(graph.held)])
+    return Window(graph.variables.keys(), graph.edges, still, _held(graph, ()))
 
 
 def _held(graph: KeyframeGraph, named: Iterable[int]) -> frozenset[int]:

@@ -27,3 +27,9 @@ class GaussianArrays:
         """The same with lengths times ``factor``; what is seen from cameras that are moved alike stays as it is."""
         means, scales = self.means * np.float32(factor), self.scales * np.float32(factor)
         return replace(self, means=means, scales=scales)
+
+
+def of_degree(gaussians: GaussianArrays, degree: int) -> GaussianArrays:
+    """The same with harmonics up to ``degree``, those that are new at zero."""
+    new = (degree + 1) ** 2 - 1 - gaussians.sh_rest.shape[1]
+    return replace(gaussians, sh_rest=np.pad(gaussians.sh_rest, ((0, 0), (0, max(0, new)), (0, 0))))

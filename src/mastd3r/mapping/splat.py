@@ -27,6 +27,11 @@ class Splat:
         self._map, self._near = GaussianMap.from_arrays(gaussians, device), near
         self._background = torch.tensor(list(background), dtype=torch.float32, device=device)
 
+    @property
+    def count(self) -> int:
+        """Gaussians."""
+        return len(self._map)
+
     def render(self, world_from_cam: Array, camera: Camera) -> tuple[Array, Array, Array]:
         """Colour (h,w,3) float32 0..1, depth (h,w) in map units (0 where nothing is), alpha (h,w)."""
         view = torch.from_numpy(np.linalg.inv(np.asarray(world_from_cam, float)))

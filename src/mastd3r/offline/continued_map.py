@@ -26,7 +26,7 @@ from ..export.point_cloud import read_cloud
 from ..export.read_run import Run
 from ..export.run_folder import RunFolder, stamp
 from ..graph.keyframe_graph import FrameRecord
-from ..mapping.gaussians import GaussianArrays
+from ..mapping.gaussian_arrays import GaussianArrays, of_degree
 from ..mapping.ply import read_gaussians_ply
 from ..mapping.process import Outcome
 from ..mapping.quality import resolved
@@ -174,7 +174,7 @@ def continue_map(
     steps = config.mapping.iterations or 0
     begun = None
     if start.gaussians is not None:
-        begun = Outcome(_of_degree(start.gaussians, config.mapping.sh_degree or 0), steps // 2, len(material.views))
+        begun = Outcome(of_degree(start.gaussians, config.mapping.sh_degree or 0), steps // 2, len(material.views))
     with job.remembered(folder):
         trained = train_map(folder, config, start.cloud, material.views, device, begun, reporter)
         folder.note(*notes)
@@ -311,9 +311,3 @@ def _frames_of(run: Run) -> list[FinalFrame]:
         pose = np.full((4, 4), np.nan) if n is None else run.trajectory.world_from_cam[n]
         out.append(FinalFrame(record, pose, state))
     return out
-
-
-def _of_degree(gaussians: GaussianArrays, degree: int) -> GaussianArrays:
-    """The same Gaussians with harmonics up to ``degree``, those that are new at zero."""
-    new = (degree + 1) ** 2 - 1 - gaussians.sh_rest.shape[1]
-    return replace(gaussians, sh_rest=np.pad(gaussians.sh_rest, ((0, 0), (0, max(0, new)), (0, 0))))

@@ -13,6 +13,8 @@ from ..alignment.reproject import StaticMatches, solve_pose
 from ..config import Config
 from ..errors import InputError
 from ..geometry.se3 import interpolate, inverse
+from ..geometry.sim3 import Sim3
+from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.bundle_adjustment import SolveReport
 from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
@@ -46,7 +48,7 @@ def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = T
         return None
     report = _solve(graph, config) if started else None
     seen, _ = observed(graph, graph.members())
-    if needs_motion and len(graph.roots()) == 1:
+    if needs_motion and len(graph.roots()) == 1 and not graph.held:  # in a saved map depth is known
         if seen.kind == "none":
             raise InputError(
                 f"the camera never moves: expected one that changes its place, got {seen.still_ratio:.0%} of the "
@@ -67,6 +69,25 @@ def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = T
     log.info("joint optimisation: %d keyframes, %d edges, %d steps, cost %.0f -> %.0f", len(graph.keyframes),
              len(graph.edges), report.iterations, report.cost_first, report.cost_last)  # fmt: skip
     return seen
+
+
+def turned_upright(graph: KeyframeGraph) -> tuple[str, dict[str, Any]]:
+    """The world with gravity along +y, as viewers of splats expect it of such files; a saved map's stays as it is.
+
+    Gives the line for the choices of run.json, and its key ``world``.
+    """
+    if graph.held:
+        return "world: that of the saved map", {}
+    members = graph.members()
+    direction, sigma = down(np.stack([graph.world_from_cam(k) for k in members]))
+    turn = turn_upright(direction)
+    graph.transform_keyframes(range(len(graph.keyframes)), Sim3(turn, np.zeros(3)))
+    told = sigma < TOLD_RAD
+    note = (
+        f"world upright: down is +y, from {'the horizon of' if told else 'the down axes of'} {len(members)} "
+        f"keyframes, to {np.degrees(sigma):.0f} deg (1 sigma)"
+    )
+    return note, {"down_sigma_deg": float(np.degrees(sigma)), "upright_from_first": turn.tolist()}
 
 
 def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:

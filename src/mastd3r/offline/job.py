@@ -27,8 +27,6 @@ from ..export.machine import peak_rss_mib
 from ..export.mask_video import MaskVideo
 from ..export.read_run import read_run
 from ..export.run_folder import RunFolder
-from ..geometry.sim3 import Sim3
-from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.focal_sigma import focal_facts
 from ..graph.initialisation import bootstrap
 from ..mapping.process import Outcome
@@ -39,7 +37,7 @@ from ..tracking.memory import TrackingMemory
 from ..types import MEASURED, Frame
 from .checkpoints import Checkpoints, JobMemory, Stage
 from .dense import write_dense_cloud_of
-from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
+from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of, turned_upright
 from .live_map import LiveMap
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
 from .metres import in_lengths, scale_notes, scale_of_run
@@ -131,7 +129,8 @@ class RunJob:
         with self.timed("joint optimisation"):
             self.folder.update(loops=[{"frames": [i, j], "verdict": said} for i, j, said in graph.loops])
             seen = finish_graph(graph, self.config, needs_motion=provider.depth_sigma_ratio is None)
-            self._turns_only = seen is not None and seen.kind == "rotation" and provider.depth_sigma_ratio is None
+            may_turn_only = provider.depth_sigma_ratio is None and not graph.held
+            self._turns_only = seen is not None and seen.kind == "rotation" and may_turn_only
             if seen is not None:
                 said = TURNS_ONLY if self._turns_only else None
                 self.folder.update(observability={**asdict(seen), "said": said})
@@ -145,7 +144,9 @@ class RunJob:
             assumed, found = provider.depth_sigma_ratio, own_depth_spread(graph)
             if assumed is not None and found is not None:
                 self.folder.note(f"own depths differ from the solved by {found:.1%} (1 sigma), assumed {assumed:.1%}")
-            self._turn_upright()
+            note, facts = turned_upright(graph)
+            self.folder.note(note)
+            self.folder.update(world=facts)
             final = final_frames(graph)
             if self._live is not None:
                 self._begun, facts, note = self._live.finish(graph, self.tracked.lens)
@@ -165,7 +166,7 @@ class RunJob:
                 self._write_trajectory()
                 seen = seen.with_poses(self._final)
         colors = {} if self._turns_only else seen.colors
-        cloud = static_cloud(self.graph, colors, seen.moving)
+        cloud = self.tracked.whole_cloud(static_cloud(self.graph, colors, seen.moving))
         if not self._turns_only:
             self.folder.write_cloud(cloud)
             px = self.tracked.photograph_px
@@ -174,7 +175,7 @@ class RunJob:
 
     def make_map(self, material: MapMaterial) -> None:
         """The Gaussian map, its renders of the holdout frames, and the flight through it."""
-        cloud, views = material.cloud, material.seen.views
+        cloud, views = self.tracked.seeds(material), material.seen.views
         if not self.config.mapping.enabled or self._turns_only:
             return
         if not views or not len(cloud.points_world):
@@ -182,7 +183,14 @@ class RunJob:
             return
         with self.timed("map"):
             trained = train_map(
-                self.folder, self.config, cloud, views, self.tracked.map_device, self._begun, self.reporter
+                self.folder,
+                self.config,
+                cloud,
+                views,
+                self.tracked.map_device,
+                self._begun,
+                self.reporter,
+                self.tracked.splat_before(),
             )
         self.metrics |= trained.metrics
         if self.config.mapping.refine_poses and self.graph.started:
@@ -237,7 +245,7 @@ class RunJob:
             **evaluation.metrics,
             **self.metrics,
             **{f"frames_{s}": states[s] for s in ("tracked", "interpolated", "lost")},
-            "keyframes": len(self.graph.keyframes),
+            "keyframes": len(self.graph.keyframes) - self.graph.held,
             "focal_px": _focal_px(self.tracked.lens()),
             "fps_tracking": self.frames / self.timings["tracking"],
             "fps_total": self.frames / elapsed,
@@ -277,20 +285,6 @@ class RunJob:
             if self.processor_s is not None:
                 self.processor_s[stage] = self.processor_s.get(stage, 0.0) + time.process_time() - busy
                 self.folder.record["processor_s"] = self.processor_s
-
-    def _turn_upright(self) -> None:
-        """The world with gravity along +y, as viewers of splats expect it of such files."""
-        graph = self.graph
-        members = graph.members()
-        direction, sigma = down(np.stack([graph.world_from_cam(k) for k in members]))
-        turn = turn_upright(direction)
-        graph.transform_keyframes(range(len(graph.keyframes)), Sim3(turn, np.zeros(3)))
-        told = sigma < TOLD_RAD
-        self.folder.note(
-            f"world upright: down is +y, from {'the horizon of' if told else 'the down axes of'} {len(members)} "
-            f"keyframes, to {np.degrees(sigma):.0f} deg (1 sigma)"
-        )
-        self.folder.update(world={"down_sigma_deg": float(np.degrees(sigma)), "upright_from_first": turn.tolist()})
 
     # -- parts of the stages ---------------------------------------------------------------------------------
 
@@ -336,7 +330,7 @@ class RunJob:
         self.folder.write_trajectory(trajectory_of(self._final))
         lens = self.tracked.lens()
         camera = lens.radial if isinstance(lens, OpenCvLens) else lens
-        focal = focal_facts(graph, given=bool(self.config.camera.intrinsics))
+        focal = focal_facts(graph, given=self.tracked.lens_is_given)
         self.folder.write_camera(camera, lens.distortion if isinstance(lens, OpenCvLens) else None, **focal)
         lost = [f for f in self._final if f.state == "interpolated"]
         facts: dict[str, Any] = {
@@ -351,7 +345,8 @@ class RunJob:
         self.folder.update(
             camera=facts,
             scale=self._scale,
-            graph={"keyframes": len(graph.keyframes), "edges": len(graph.edges)},
+            continues=self.tracked.continues(),
+            graph={"keyframes": len(graph.keyframes) - graph.held, "edges": len(graph.edges)},
             files=names_by_time(self.source, [(f.record.index, f.record.timestamp_s) for f in self._final]),
         )
         if lost:
@@ -380,6 +375,7 @@ class RunJob:
         self.folder.make_room()
         try:
             graph = self.graph
+            graph.leave_map_unless_found()
             started = self._final or graph.started or (len(graph.members()) > 1 and bootstrap(graph))
             if not self._final and started:  # before that there is neither place nor lens
                 if graph.initialised:

@@ -7,13 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera.opencv_lens import OpenCvLens
-from ..camera.pinhole import Camera
-from ..camera.rectification import Rectifier
 from ..config import Config
 from ..errors import InputError
 from ..export.map_folder import MapKeyframe, MapRecord, write_map
@@ -23,10 +19,13 @@ from ..export.tracks import Tracks
 from ..geometry.se3 import inverse, transform
 from ..mapping.ply import write_gaussians_ply
 from ..parts import chosen_features, parts_of
-from ..pointmap.geometric import GeometricPointmaps, working_size
-from ..types import Frame, Source, Trajectory, WorkFrame
+from ..reading.files import user_path
+from ..types import Source, Trajectory, WorkFrame
+from .map_drawing import digest_of, drawn
 from .photographs import check_size
 from .renders import gaussians_of, lens_of
+from .saved_map import SavedMap
+from .working_eye import Look, WorkingEye, one_a_cell
 
 Array = NDArray[Any]
 STEP = 1e-3  # relative, of an inverse depth: over it a projection is taken to be straight
@@ -35,75 +34,71 @@ STEP = 1e-3  # relative, of an inverse depth: over it a projection is taken to b
 def save_run_as_map(run: Run, source: Source, source_path: Path, config: Config, out: Path) -> None:
     """Write the map of a run to the folder ``out``, in ``run.unit``. ``source``: its photographs, from ``source_path``.
 
-    Raises InputError for a run without keyframes, lens and tracks, and a source that is not the run's; OutputError.
+    A run that went on in a saved map keeps the keyframes of that one too. Raises InputError for a run without
+    keyframes, lens and tracks, a source that is not the run's, and a map that is no longer there; OutputError.
     """
-    record = map_of(run, source, config)
-    splat = gaussians_of(run) if os.path.lexists(run.path / "gaussians.ply") else None
+    before = _map_before(run)
+    record = map_of(run, source, config, before)
+    inputs = [run.path, source_path] if before is None else [run.path, source_path, before.path]
+    splat = before.gaussians if before is not None else None
+    if os.path.lexists(run.path / "gaussians.ply"):
+        splat = gaussians_of(run)
+    elif splat is not None:
+        splat = splat.in_lengths(run.lengths)
     write_splat = None if splat is None else lambda path: write_gaussians_ply(path, splat)
-    write_map(out, record, write_splat, [run.path, source_path])
+    write_map(out, record, write_splat, inputs)
 
 
-def map_of(run: Run, source: Source, config: Config) -> MapRecord:
+def _map_before(run: Run) -> SavedMap | None:
+    """The map that a run went on in."""
+    facts = run.record.get("continues") or {}
+    if not facts.get("found"):
+        return None
+    saved = SavedMap(user_path(str(facts.get("map") or "."), f"{run.path}/run.json continues.map"))
+    if digest_of(saved.record) != facts.get("digest"):
+        raise InputError(f"{saved.path}: expected the map that {run.path} went on in, got another one")
+    return saved
+
+
+def map_of(run: Run, source: Source, config: Config, before: SavedMap | None = None) -> MapRecord:
     """The same as a value."""
     lens, tracks = lens_of(run), run.tracks()
     check_size(run, source, lens)
     keyframes = run.trajectory.tracked().keyframes()  # poses that were guessed are no map
-    if len(keyframes.timestamps_s) < 2 or not len(tracks.point):
+    if before is None and (len(keyframes.timestamps_s) < 2 or not len(tracks.point)):
         got = f"{len(keyframes.timestamps_s)} keyframes and {len(tracks.points_world)} points"
         raise InputError(f"{run.path}: expected keyframes with points of known depth, got {got}")
     eye = WorkingEye(lens, config)
-    works = _work_frames(run, keyframes, source, eye)
+    looks = _looks(run, keyframes, source, eye)
     points = _PointsOfKeyframes(tracks, keyframes, eye)
     made = [
-        _keyframe(work, pose, points.of(n, work), eye.moving(run.mask(work.timestamp_s)))
-        for n, (work, pose) in enumerate(zip(works, keyframes.world_from_cam, strict=True))
+        _keyframe(look, pose, points.of(n, look.work), eye.moving(run.mask(look.work.timestamp_s)))
+        for n, (look, pose) in enumerate(zip(looks, keyframes.world_from_cam, strict=True))
     ]
-    name, described = _described(config, eye, works)
+    size, grid, known = eye.provider.size, eye.grid, list[MapKeyframe]()
+    name, described = _described(config, eye, [look.work.gray for look in looks])
     made = [replace(kf, feature_px=d[0], descriptors=d[1]) for kf, d in zip(made, described, strict=True)]
-    size, grid = eye.provider.size, works[0].grid
-    return MapRecord(size, grid, lens, name, run.config, tuple(made), str(run.path.resolve()), run.unit)
+    if before is not None:
+        record = drawn(before.record, before.eye.camera, eye.camera, eye.provider)
+        known = [_in_lengths(kf, run.lengths) for kf in record.keyframes]
+        if record.features != name:
+            described = _described(config, eye, [kf.gray for kf in known])[1]
+            known = [replace(kf, feature_px=d[0], descriptors=d[1]) for kf, d in zip(known, described, strict=True)]
+    return MapRecord(size, grid, lens, name, run.config, (*known, *made), str(run.path.resolve()), run.unit)
 
 
-class WorkingEye:
-    """How a map sees photographs of its lens: at working size, rectified where the lens is more than radial.
-
-    Always as the geometric provider does, whichever pointmaps the run had.
-    """
-
-    def __init__(self, lens: Camera | OpenCvLens, config: Config) -> None:
-        """``lens`` over the photographs."""
-        self.lens = lens
-        self.rectifier = Rectifier(lens) if isinstance(lens, OpenCvLens) else None
-        seen = (lens.width, lens.height) if self.rectifier is None else self.rectifier.size
-        size = working_size(*seen, config.tracking.area_px)
-        self.provider = GeometricPointmaps(*size, config.tracking.cell_px)
-        pinhole = lens if self.rectifier is None else self.rectifier.pinhole
-        assert isinstance(pinhole, Camera)
-        self.camera = pinhole.resized(*size)  # of working images
-
-    def look(self, index: int, timestamp_s: float, image: Array) -> WorkFrame:
-        """A photograph (h, w, 3) uint8 RGB of the lens's size."""
-        seen = image if self.rectifier is None else self.rectifier.image(image)
-        return self.provider.look(Frame(index, timestamp_s, seen))
-
-    def moving(self, mask: Array) -> Array:
-        """(h, w) uint8 at working size of a mask over the photograph, of any size."""
-        seen = mask if self.rectifier is None else self.rectifier.semantic(mask.astype(np.float32))
-        return np.rint(cv2.resize(seen.astype(np.float32), self.provider.size)).astype(np.uint8)
-
-    def working_px(self, px: Array) -> Array:
-        """(m, 2) pixels of the photograph at working size."""
-        if self.rectifier is not None:
-            return self.camera.project(self.rectifier.lens.rays(px))
-        scale = np.array(self.provider.size) / np.array([self.lens.width, self.lens.height])
-        return (px + 0.5) * scale - 0.5
+def _in_lengths(kf: MapKeyframe, factor: float) -> MapKeyframe:
+    """The same with lengths times ``factor``."""
+    pose = kf.world_from_cam.copy()
+    pose[:3, 3] *= factor
+    return replace(kf, world_from_cam=pose, inv_depth=kf.inv_depth / factor, depth_info=kf.depth_info * factor**2)
 
 
-def _work_frames(run: Run, keyframes: Trajectory, source: Source, eye: WorkingEye) -> list[WorkFrame]:
+def _looks(run: Run, keyframes: Trajectory, source: Source, eye: WorkingEye) -> list[Look]:
     """The keyframes' photographs, looked at; in order of time."""
     wanted = {stamp(float(t)): n for n, t in enumerate(keyframes.timestamps_s)}
-    found = {}
-    for frame in source.frames():
+    found = dict[int, Look]()
+    for frame in source.frames() if wanted else ():
         n = wanted.get(stamp(frame.timestamp_s))
         if n is not None:
             found[n] = eye.look(n, float(keyframes.timestamps_s[n]), frame.as_taken.image)
@@ -136,16 +131,10 @@ class _PointsOfKeyframes:
         The point measured nearest to the pixel that was chosen for its cell; where there is none, that pixel itself
         and the median depth, with no information.
         """
-        rows, cols = work.grid
         mine = np.flatnonzero(self.kf == n)
         points = transform(self.cam_from_world[n], self.world[self.point[mine]])
-        at = np.floor((self.px[mine] + 0.5) / self.eye.provider.cell_px).astype(int)
-        good = (points[:, 2] > 0) & (at >= 0).all(1) & (at < [cols, rows]).all(1)
-        mine, points, at = mine[good], points[good], at[good]
-        cell = at[:, 1] * cols + at[:, 0]
-        order = np.argsort(np.linalg.norm(self.px[mine] - work.px[cell], axis=1), kind="stable")
-        cells, first = np.unique(cell[order], return_index=True)
-        chosen = order[first]
+        mine, points = mine[points[:, 2] > 0], points[points[:, 2] > 0]
+        cells, chosen = one_a_cell(self.px[mine], work, self.eye.provider.cell_px)
         px, info = work.px.copy(), np.zeros(len(work.px))
         inv_depth = np.full(len(px), 1.0 if not len(chosen) else float(np.median(1 / points[chosen, 2])))
         px[cells], inv_depth[cells] = self.px[mine[chosen]], 1 / points[chosen, 2]
@@ -169,18 +158,20 @@ class _PointsOfKeyframes:
         return out
 
 
-def _keyframe(work: WorkFrame, world_from_cam: Array, points: tuple[Array, Array, Array], moving: Array) -> MapKeyframe:
-    px, inv_depth, info = points
+def _keyframe(look: Look, world_from_cam: Array, points: tuple[Array, Array, Array], moving: Array) -> MapKeyframe:
+    (px, inv_depth, info), work = points, look.work
     none, texture = np.zeros((0, 2), np.float32), work.texture.astype(np.float32)
     points_of = (px, texture, inv_depth, info)
-    return MapKeyframe(work.timestamp_s, world_from_cam, work.gray, moving, *points_of, none, none.astype(np.float16))
+    x, y = np.clip(np.rint(px), 0, np.array(work.gray.shape[::-1]) - 1).astype(int).T
+    features = (none, none.astype(np.float16))
+    return MapKeyframe(work.timestamp_s, world_from_cam, work.gray, moving, *points_of, *features, look.small[y, x])
 
 
-def _described(config: Config, eye: WorkingEye, works: list[WorkFrame]) -> tuple[str, list[tuple[Array, Array]]]:
-    """The features' name and the features of each keyframe, where the part can say them."""
+def _described(config: Config, eye: WorkingEye, images: list[Array]) -> tuple[str, list[tuple[Array, Array]]]:
+    """The features' name and the features of each keyframe's image (h, w), where the part can say them."""
     features = parts_of(eye.provider, config).features
     if not hasattr(features, "descriptions"):
         nothing = np.zeros((0, 2), np.float32)
-        return "", [(nothing, nothing.astype(np.float16))] * len(works)
-    found = features.descriptions([work.gray for work in works])
+        return "", [(nothing, nothing.astype(np.float16))] * len(images)
+    found = features.descriptions(images)
     return chosen_features(config)[0], [(px.astype(np.float32), d.astype(np.float16)) for px, d in found]

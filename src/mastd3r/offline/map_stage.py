@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,8 @@ from ..config import Config
 from ..evaluation.image_error import psnr
 from ..export.files import replacing
 from ..export.run_folder import RunFolder
+from ..mapping.carried import with_unseen
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.mapper import Mapper
 from ..mapping.ply import read_gaussians_ply, write_gaussians_ply
 from ..mapping.process import Outcome
@@ -49,9 +51,11 @@ def train_map(
     device: str,
     begun: Outcome | None,
     reporter: Reporter,
+    before: GaussianArrays | None = None,
 ) -> TrainedMap:
     """Train, from what ``begun`` left where a map was made while tracking, and write the splat.
 
+    What no view shows of ``before``, the splat of the saved map that the video goes on in, stays as it is.
     Stopped by the user, the splat is written as it is.
     """
     m = config.mapping
@@ -68,7 +72,7 @@ def train_map(
             else:
                 mapper.refine(steps - done, progress)
         finally:
-            median_depth = write_splat(folder, mapper, device, progress.steps)
+            median_depth = write_splat(folder, mapper, device, progress.steps, before, views)
     splat = Splat(read_gaussians_ply(folder.path / "gaussians.ply"), NEAR_RATIO * median_depth, device=device)
     figures = []
     for view in views[:: max(1, len(views) // MAPPED_SAMPLES)]:
@@ -77,22 +81,29 @@ def train_map(
         figures.append(psnr(color, view.image / 255, view.static > 0.5))
     known = [f for f in figures if f is not None and np.isfinite(f)]
     mapped = float(np.mean(known)) if known else None
-    metrics = {"gaussians": len(mapper.gaussians.means), "psnr_mapped": mapped}
+    metrics = {"gaussians": splat.count, "psnr_mapped": mapped}
     return TrainedMap(mapper, splat, median_depth, metrics)
 
 
-def write_splat(folder: RunFolder, mapper: Mapper, device: str, steps: int) -> float:
+def write_splat(
+    folder: RunFolder, mapper: Mapper, device: str, steps: int, before: GaussianArrays | None, views: Sequence[View]
+) -> float:
     """gaussians.ply and gaussians.spz, and what run.json says of them; gives the map's median depth.
 
-    ``steps`` is what this training took. Files that are there are replaced once both new ones are whole.
+    ``steps`` is what this training took. ``before``: a splat of which what no view shows goes on. Files that are there
+    are replaced once both new ones are whole.
     """
     mapper.settle()
     median_depth = float(mapper.facts["median_depth"])
+    gaussians, facts = mapper.gaussians, dict(mapper.facts)
+    if before is not None:
+        gaussians = with_unseen(gaussians, before, views, NEAR_RATIO * median_depth, device)
+        facts["carried"] = len(gaussians.means) - len(mapper.gaussians.means)
     with replacing(folder.path / "gaussians.ply") as ply, replacing(folder.path / "gaussians.spz") as spz:
-        write_gaussians_ply(ply, mapper.gaussians)
-        write_gaussians_spz(spz, mapper.gaussians)
+        write_gaussians_ply(ply, gaussians)
+        write_gaussians_spz(spz, gaussians)
     per_unit = depth_png_per_unit(median_depth)
-    folder.update(map={"device": device, "steps": steps, **mapper.facts, "depth_png_per_unit": per_unit})
+    folder.update(map={"device": device, "steps": steps, **facts, "depth_png_per_unit": per_unit})
     return median_depth
 
 

@@ -53,7 +53,7 @@ def material_of_graph(tracked: Tracked, final: list[FinalFrame], record: Mapping
         trajectory_of(final),
         static_tracks(graph, final, no_color, moving, tracked.photograph_px),
         tracked.lens(),
-        focal_facts(graph, given=bool(tracked.config.camera.intrinsics))["focal_sigma_ratio"] or 0.0,
+        focal_facts(graph, given=tracked.lens_is_given)["focal_sigma_ratio"] or 0.0,
         None if down_sigma_deg is None else float(np.radians(down_sigma_deg)),
         names_by_time(tracked.source, [(f.record.index, f.record.timestamp_s) for f in final]),
     )
@@ -84,6 +84,10 @@ def scale_facts(wanted: Measure, map_: Callable[[], Material], record: Mapping[s
 
 def scale_of_run(tracked: Tracked, final: list[FinalFrame], record: Mapping[str, Any]) -> dict[str, Any] | None:
     """``scale_facts`` of a run whose files are all still to be written, hence in metres; None where nobody asked."""
+    before = tracked.continues()
+    if before is not None and before["found"] and before["unit"] == "m":
+        said = f"lengths are those of the map {before['name']}"
+        return {"asked": "map", "applied": True, "metres_per_unit": 1.0, "sigma_ratio": None, "said": said}
     if tracked.scale is None:
         return None
     facts = scale_facts(tracked.scale, lambda: material_of_graph(tracked, final, record), record)

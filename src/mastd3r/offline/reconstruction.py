@@ -157,6 +157,14 @@ class Reconstruction:
         """
         return dict(self._run.record.get("scale") or {})
 
+    @property
+    def continues(self) -> dict[str, Any]:
+        """Of a run that went on in a saved map: whether it was ``found`` there, how many images were ``placed``.
+
+        ``said`` is the line for people. Empty for other runs.
+        """
+        return dict(self._run.record.get("continues") or {})
+
     def measure_scale(self, by: str) -> dict[str, Any]:
         """Metres a unit of this map, as ``mastd3r scale``; run.json has them from here on, and exports are in metres.
 

@@ -14,9 +14,11 @@ from ..camera.pinhole import Camera
 from ..camera.rectification import Rectifier
 from ..config import Config
 from ..graph.keyframe_graph import KeyframeGraph
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..metric.measure import Measure
 from ..parts import Parts
 from ..types import Source, StaticCloud
+from .extended_map import ExtendedMap, in_view
 from .smoothing import SmoothedMasks
 
 Array = NDArray[Any]
@@ -42,6 +44,28 @@ class Tracked:
     rectifier: Rectifier | None
     map_device: str
     scale: Measure | None = None  # what the metres are taken from
+    extends: ExtendedMap | None = None  # the saved map that the video goes on in
+
+    @property
+    def lens_is_given(self) -> bool:
+        """By the options, or by a saved map."""
+        return bool(self.config.camera.intrinsics) or self.extends is not None
+
+    def whole_cloud(self, cloud: StaticCloud) -> StaticCloud:
+        """The static cloud with the points of the map that the video goes on in."""
+        return cloud if self.extends is None else self.extends.with_points(cloud, self.graph)
+
+    def seeds(self, material: MapMaterial) -> StaticCloud:
+        """The points that a splat starts from: what no view shows cannot be trained."""
+        return material.cloud if self.extends is None else in_view(material.cloud, material.seen.views)
+
+    def splat_before(self) -> GaussianArrays | None:
+        """That of the map that the video goes on in."""
+        return None if self.extends is None else self.extends.splat(self.graph)
+
+    def continues(self) -> dict[str, Any] | None:
+        """For run.json: that map, and what of the video was found in it."""
+        return None if self.extends is None else self.extends.facts(self.graph)
 
     def lens(self) -> Camera | OpenCvLens:
         """The lens over the photograph: the calibrated one where photographs are rectified."""

@@ -7,7 +7,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -39,13 +39,21 @@ def array_of(path: Path, expected: str) -> NDArray[Any]:
         raise BrokenArray(f"{path}: expected {expected} as .npy, got a broken file ({_words(e)})") from e
 
 
-def arrays_of(path: Path, wanted: Mapping[str, str], expected: str) -> dict[str, NDArray[Any]]:
-    """Arrays of an .npz file by name; ``wanted``: name -> type, as "<f4". Raises InputError."""
+def arrays_of(
+    path: Path, wanted: Mapping[str, str], expected: str, may_lack: Collection[str] = ()
+) -> dict[str, NDArray[Any]]:
+    """Arrays of an .npz file by name; ``wanted``: name -> type, as "<f4". Raises InputError.
+
+    Those in ``may_lack`` need not be there.
+    """
     check_plain(path, expected, most=MOST_BYTES)
     out = {}
     try:
         with zipfile.ZipFile(path) as archive:
+            there = set(archive.namelist())
             for name, kind in wanted.items():
+                if name in may_lack and f"{name}.npy" not in there:
+                    continue
                 info = archive.getinfo(f"{name}.npy")
                 with archive.open(info) as file:
                     out[name] = _array(file, min(info.file_size, MOST_BYTES))

@@ -48,7 +48,7 @@ class CovisibilityEdges:
 
     def add_recent(self, graph: KeyframeGraph, kf: Keyframe, before: int) -> list[int]:
         """Matches with the ``neighbours`` last keyframes; those but ``before``, with which there are some already."""
-        recent = [k for k in graph.members()[-2 - self.config.neighbours : -1] if k != before]
+        recent = [k for k in graph.free_members()[-2 - self.config.neighbours : -1] if k != before]
         self.parts.provider.expect([(graph.keyframes[k].work, kf.work) for k in (before, *reversed(recent))])
         for k in reversed(recent):
             self.add(graph, k, kf.id)

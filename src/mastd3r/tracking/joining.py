@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 
 from ..concurrency import Future
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.submaps import join, with_scale
 from .covisibility import CovisibilityEdges
+from .map_entry import MapEntry
 from .places import candidates
-from .two_view import TwoViewEstimator
+from .two_view import TwoView, TwoViewEstimator
 
 log = logging.getLogger(__name__)
 MATCHED_AROUND = 2  # keyframes on either side of the recognised one that are matched as well
@@ -22,16 +24,12 @@ def join_recognised(
     two_view: TwoViewEstimator,
     edges: CovisibilityEdges,
     places: PlaceRecognition,
+    entry: MapEntry,
 ) -> bool:
-    """Recognise a place of another submap in ``kf``; the two become one. The older submap's world is kept."""
+    """Recognise a place of another submap in ``kf``; the two become one. The other submap's world is kept."""
     own = graph.submap_of[kf.id]
-    others = [k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}]
-    moving = Future.done(kf.moving / 255.0)
-    for other in candidates(places, two_view.parts, graph, kf.work, others):
-        view = two_view.relocalised(other, kf.work, moving)
-        if view is None or not two_view.beyond_doubt(view, kf.work, moving):
-            continue
-        pose = view.alignment.new_from_ref
+    for view in _seen_elsewhere(graph, kf, two_view, places, entry):
+        other, pose = view.anchor, view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
         if kf_from_other is None:
             continue
@@ -45,3 +43,19 @@ def join_recognised(
         graph.solve_all(10, 2.0)
         return True
     return False
+
+
+def _seen_elsewhere(
+    graph: KeyframeGraph, kf: Keyframe, two_view: TwoViewEstimator, places: PlaceRecognition, entry: MapEntry
+) -> Iterator[TwoView]:
+    """A keyframe as others see it, of a saved map and of other submaps, beyond doubt."""
+    moving = Future.done(kf.moving / 255.0)
+    in_map = entry.view(kf.work, moving)
+    if in_map is not None:
+        yield in_map
+    own = graph.submap_of[kf.id]
+    others = entry.open_to([k.id for k in graph.keyframes if graph.submap_of[k.id] in graph.started - {own}])
+    for other in candidates(places, two_view.parts, graph, kf.work, others):
+        view = two_view.relocalised(other, kf.work, moving)
+        if view is not None and two_view.beyond_doubt(view, kf.work, moving):
+            yield view

@@ -22,6 +22,7 @@ from ..types import WorkFrame
 from .covisibility import CovisibilityEdges
 from .depth_prior import own_depth_prior, predicted_depth
 from .joining import join_recognised
+from .map_entry import MAP, MapEntry
 from .observation import Observation
 from .state import TrackedFrame, TrackingState, status_in
 from .two_view import Start, TwoView, TwoViewEstimator, matched_share
@@ -45,6 +46,7 @@ class Keyframes:
     def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph, two_view: TwoViewEstimator) -> None:
         self.config, self.parts, self.graph, self.two_view = config, parts, graph, two_view
         self.edges = CovisibilityEdges(config.graph, parts)
+        self.entry = MapEntry(config, parts, graph, two_view)
         self._worker = Worker("edges")
         self._pending: Future[KeyframeGraph] | None = None  # the graph with the newest keyframe's edges, not yet taken
         self._newest_at = 0  # records there were when the newest keyframe was connected
@@ -108,7 +110,8 @@ class Keyframes:
         nearby = view.motion_ratio <= t.keyframe_motion_ratio
         if not self.two_view.accepted(view) or not nearby or matched_share(kf, view.weight) < KNOWN_PLACE_MATCHED:
             return None
-        if abs(near - anchor.id) > 1 and not graph.connected(near, anchor.id):
+        far = abs(near - anchor.id) > 1 and max(near, anchor.id) >= graph.held
+        if far and not graph.connected(near, anchor.id):
             self._close(near, anchor.id)
         return _following(state, view, view.matched)
 
@@ -183,7 +186,7 @@ class Keyframes:
     def _connect(self, kf: Keyframe, before: int) -> None:
         """Connect a new keyframe to the map: beside the next frames where nothing else depends on it, now otherwise."""
         graph = self.graph
-        everything = len(graph.members()) in SOLVED_AS_A_WHOLE
+        everything = len(graph.free_members()) in SOLVED_AS_A_WHOLE
         hurry = len(graph.records) - self._newest_at < EDGES_AFTER  # the next may come before they are made
         self._newest_at = len(graph.records)
         alone = graph.window_is_all or everything or hurry or len(graph.started) > 1
@@ -215,12 +218,12 @@ class Keyframes:
 
     def joins(self, kf: Keyframe) -> bool:
         """True where ``kf`` shows a place of another submap, and the two have become one."""
-        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places)
+        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places, self.entry)
 
     # -- after the last frame --------------------------------------------------------------------------------
 
     def finish(self, state: TrackingState) -> None:
-        """Keep what the last frame alone sees, and join the submaps that can be."""
+        """Keep what the last frame alone sees, and join the submaps that can be; leave a map where it was not found."""
         self.settle()
         graph, last = self.graph, state.last
         if last is not None:
@@ -232,12 +235,14 @@ class Keyframes:
             enough = LAST_MOTION * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
             if self.two_view.accepted(view) and view.motion_ratio > enough:
                 self._add(state, view)
-        if graph.started and graph.keyframes and not graph.initialised and not bootstrap(graph):
+        elsewhere = graph.started - ({MAP} if self.entry.wanted else set())
+        if elsewhere and graph.keyframes and not graph.initialised and not bootstrap(graph):
             graph.drop_submap()
             graph.submap = graph.submap_of[graph.latest.id]
         for submap in sorted(graph.started)[1:]:
             graph.submap = submap
             any(self.joins(graph.keyframes[k]) for k in graph.members())
+        graph.leave_map_unless_found()
 
     def close(self) -> None:
         """End the thread."""

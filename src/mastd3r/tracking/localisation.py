@@ -78,8 +78,9 @@ class _Seen:
 class Localiser:
     """Finds images in a map; the map stays as it is."""
 
-    def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph) -> None:
-        self.parts, self.graph = parts, graph
+    def __init__(self, config: Config, parts: Parts, graph: KeyframeGraph, submap: int = 0) -> None:
+        """``submap``: the part of the graph that is the map."""
+        self.parts, self.graph, self.submap = parts, graph, submap
         self.two_view = TwoViewEstimator(config, parts, graph)
 
     def find(self, work: WorkFrame, moving: Array, near: Place | None = None) -> Place | Unplaced:
@@ -132,7 +133,7 @@ class Localiser:
 
     def _candidates(self, work: WorkFrame) -> list[Keyframe]:
         """By small pictures and by features in turn, none twice."""
-        graph, ids = self.graph, self.graph.members()
+        graph, ids = self.graph, self.graph.members(self.submap)
         by_features = most_alike(self.parts, graph, work, ids, LOOKED_AT, LEAST_ALIKE)
         by_picture = not_unlike(self.parts, work, self.parts.places.best(graph, work, ids, LOOKED_AT), LEAST_ALIKE)
         both = [kf for n in range(LOOKED_AT) for found in (by_features, by_picture) for kf in found[n : n + 1]]
@@ -144,7 +145,7 @@ class Localiser:
             return []
         graph = self.graph
         pose, anchor = seen[0].cam_from_world, seen[0].view.anchor.id
-        apart = {k: _apart(graph, graph.variables[k].cam_from_world, pose, anchor) for k in graph.members()}
+        apart = {k: _apart(graph, graph.variables[k].cam_from_world, pose, anchor) for k in graph.members(self.submap)}
         near = [k for k, (turn, shift) in apart.items() if turn < NEAR_TURN and shift < NEAR_SHIFT and k not in asked]
         return [graph.keyframes[k] for k in sorted(near, key=lambda k: sum(apart[k]))[:LOOKED_AT]]
 
@@ -152,7 +153,7 @@ class Localiser:
         """The image seen from the keyframes that see most from about its pose (4, 4), searched from there; those that
         agree."""
         graph = self.graph
-        seen = {k: overlap(graph, k, cam_from_world) for k in graph.members()}
+        seen = {k: overlap(graph, k, cam_from_world) for k in graph.members(self.submap)}
         best = sorted(seen, key=lambda k: seen[k][1] - seen[k][0])[:MOST_VIEWS]
         views = []
         for k in (k for k in best if seen[k][0] >= LEAST_OVERLAP):

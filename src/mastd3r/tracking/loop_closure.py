@@ -62,8 +62,8 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     with others that say the same: two places may look alike.
     """
     found, doubted = list[_Seen](), list[_Seen]()
-    ids, joined, chain = graph.members(), graph.connected_pairs(), _Chain(graph)
-    for j in ids:
+    joined, chain = graph.connected_pairs(), _Chain(graph)
+    for j in graph.free_members():
         kf = graph.keyframes[j]
         far = [i for i in chain.within_drift(j) if frozenset((i, j)) not in joined]
         far = [i for i in far if not _known(found, i, j) and not _enough_of(doubted, i, j)]
@@ -251,14 +251,15 @@ def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int,
     done = graph.connected_pairs()
     pairs = []
     shared = {i: _shared(graph, i, ids) for i in ids}
-    for i in ids:
+    for i in graph.free_members():
         for j in shared[i]:
             if j >= i or i not in shared[j] or frozenset((i, j)) in done:
                 continue
             share, motion = min(shared[i][j][0], shared[j][i][0]), max(shared[i][j][1], shared[j][i][1])
             if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION:
                 pairs.append((-share, j, i))
-    made = connect([(i, j) for _, i, j in sorted(pairs)[: COVISIBLE_PAIRS * len(ids)]])
+    most = COVISIBLE_PAIRS * len(graph.free_members())
+    made = connect([(i, j) for _, i, j in sorted(pairs)[:most]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made
 

@@ -35,9 +35,10 @@ class Recovery:
         """The view as it is, where it is good; else what recovery finds. The state is what the view belongs to."""
         if seen.blank:
             return self._blank(state, seen), None
-        if view is None:
-            return self.keyframes.start(state, seen.work, prior, "first view"), None
         work = seen.work
+        if view is None:
+            found = self._rejoin(state, work, prior) if self.graph.held else None
+            return found or (self.keyframes.start(state, work, prior, "first view"), None)
         if status_in(self.graph) is Status.RELOCALISING:  # a young submap first looks for the map that was lost
             found = self._rejoin(state, work, prior)
             if found is not None:
@@ -73,18 +74,26 @@ class Recovery:
         self, state: TrackingState, work: WorkFrame, prior: Future[Array]
     ) -> tuple[TrackingState, TwoView] | None:
         """Back into a submap that has structure, out of one that has none yet: the latter is given up."""
-        graph, before = self.graph, state.anchor_before_loss
-        ids = [kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
-        places = candidates(self.parts.places, self.parts, graph, work, ids)
-        if before is not None:
-            places = [before, *(kf for kf in places if kf.id != before.id)]
-        view = self._relocalised(places, work, prior)
+        graph, entry = self.graph, self.keyframes.entry
+        view = entry.view(work, prior)
+        if view is not None:
+            graph.found_in_map(work.index)
+            log.info("frame %d found in the saved map, from keyframe %d", work.index, view.anchor.id)
+        else:
+            view = self._relocalised(self._known_to(state, work), work, prior)
         if view is None:
             return None
         graph.drop_submap()
         graph.submap = graph.submap_of[view.anchor.id]
         self.keyframes.edges.flows.clear()
         return replace(state, anchor=view.anchor, most_matched=0), view
+
+    def _known_to(self, state: TrackingState, work: WorkFrame) -> list[Keyframe]:
+        """Keyframes that have structure and may show a frame's place; where the video was lost comes first."""
+        graph, before = self.graph, state.anchor_before_loss
+        ids = self.keyframes.entry.open_to([kf.id for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started])
+        places = candidates(self.parts.places, self.parts, graph, work, ids)
+        return places if before is None else [before, *(kf for kf in places if kf.id != before.id)]
 
     def _retry(self, state: TrackingState, work: WorkFrame, prior: Future[Array]) -> Outcome:
         """The keyframe cannot be followed: first make the last good frame a keyframe, then look for features."""
