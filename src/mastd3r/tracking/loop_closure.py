@@ -59,7 +59,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
 
     Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised. One that
     asks for more drift than there can be is believed only across a passage that is badly explained, and only together
-    with others that say the same: two places may look alike.
+    with others that say the same: two places may look alike. Once such have been closed, the rest are asked again.
     """
     found, doubted = list[_Seen](), list[_Seen]()
     joined, chain = graph.connected_pairs(), _Chain(graph)
@@ -79,15 +79,24 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
                 doubted.append(seen)
     voted = _voted_for(graph, doubted)
     found += voted
-    for seen in found:
-        _connect(graph, seen)
-    loops = [seen.loop for seen in found]
-    if loops:
-        optimise_pose_graph(graph, loops)
-        graph.solve_all(10, 2.0)
+    _close(graph, found)
     if voted:  # the ends of what was badly explained have moved far
         retake_passages(graph)
-    return loops
+        doubted = [_under_poses(graph, seen.loop, seen.there, seen.back) for seen in doubted if seen not in voted]
+        late = [seen for seen in doubted if _credible(seen)]
+        _close(graph, late)
+        found, doubted = found + late, [seen for seen in doubted if seen not in late]
+    for seen in doubted:
+        _say(graph, seen.loop, f"not believed: {_drift(seen)} speak against it")
+    return [seen.loop for seen in found]
+
+
+def _close(graph: KeyframeGraph, found: list[_Seen]) -> None:
+    for seen in found:
+        _connect(graph, seen)
+    if found:
+        optimise_pose_graph(graph, [seen.loop for seen in found])
+        graph.solve_all(10, 2.0)
 
 
 class _Chain:
@@ -150,11 +159,7 @@ def _voted_for(graph: KeyframeGraph, doubted: list[_Seen]) -> list[_Seen]:
         agree = [other for other in across if _say_the_same(graph, one, other)]
         best = max(best, agree, key=len)
     ends = {s.loop.i for s in best}, {s.loop.j for s in best}
-    believed = best if min(map(len, ends)) >= VOTES else []
-    for s in doubted:
-        if s not in believed:
-            _say(graph, s.loop, f"not believed: {_drift(s)} speak against it")
-    return believed
+    return best if min(map(len, ends)) >= VOTES else []
 
 
 def _say(graph: KeyframeGraph, loop: Loop, verdict: str) -> None:
@@ -214,21 +219,23 @@ def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, bac
     new = graph.keyframes[j if better is there else i]  # depths of one end may be poor where drift began
     if turn > MAX_TURN or not two_view.beyond_doubt(better, new.work, Future.done(new.moving / 255.0)):
         return None
-    tracked = graph.variables[j].cam_from_world[:3, :3] @ graph.variables[i].cam_from_world[:3, :3].T
-    drift = float(np.linalg.norm(so3_log(j_from_i.rotation @ tracked.T)))
     scale = float(np.sqrt(j_from_i.scale / i_from_j.scale))
     if better is back:
         j_from_i = Sim3.from_rigid(inverse(back.alignment.new_from_ref), scale)
     else:
         j_from_i = Sim3.from_rigid(there.alignment.new_from_ref).in_lengths(scale)
-    gap_ratio = _gap_ratio(graph, i, j, j_from_i)
-    return _Seen(Loop(i, j, j_from_i, float(better.weight.sum())), there, back, drift, gap_ratio)
+    return _under_poses(graph, Loop(i, j, j_from_i, float(better.weight.sum())), there, back)
 
 
-def _gap_ratio(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> float:
-    """How far from where tracking has it a loop puts camera i, seen from camera j, / length of the way from i to j."""
-    tracked = graph.variables[j].cam_from_world @ inverse(graph.variables[i].cam_from_world)
-    return float(np.linalg.norm(j_from_i.translation - tracked[:3, 3])) / max(_way(graph, i, j), 1e-12)
+def _under_poses(graph: KeyframeGraph, loop: Loop, there: TwoView, back: TwoView) -> _Seen:
+    """A loop with what it asks for under the poses that there are now.
+
+    The gap: how far from where tracking has it the loop puts camera i, seen from camera j, / way from i to j.
+    """
+    tracked = graph.variables[loop.j].cam_from_world @ inverse(graph.variables[loop.i].cam_from_world)
+    drift = float(np.linalg.norm(so3_log(loop.j_from_i.rotation @ tracked[:3, :3].T)))
+    gap = float(np.linalg.norm(loop.j_from_i.translation - tracked[:3, 3]))
+    return _Seen(loop, there, back, drift, gap / max(_way(graph, loop.i, loop.j), 1e-12))
 
 
 def _way(graph: KeyframeGraph, i: int, j: int) -> float:
