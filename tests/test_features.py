@@ -232,6 +232,10 @@ def test_a_pair_is_matched_once_and_both_ways_alike() -> None:
     moving[:, : WIDTH // 2] = 1
     half = some.matches(a, b, moving, None)
     assert half is not None and network.matched == 1 and (half.ref_px[:, 0] > WIDTH // 2 - 1).all()
+    some.forget()
+    anew = some.matches(a, b, None, None)
+    assert anew is not None and (anew.ref_px == there.ref_px).all()
+    assert loaded == [1] and network.described == 4 and network.matched == 2
 
 
 class Telling(Counting):

@@ -220,6 +220,7 @@ class Slam:
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view)
         self.masks.close()
         self.keyframes.close()
+        getattr(self.parts.features, "forget", lambda: None)()  # nobody asks any more
         give_back_memory()
 
     def prefetched(self, photographs: Iterator[Frame]) -> Iterator[Frame]:

@@ -115,6 +115,13 @@ class LearnedFeatures:
         for a, b, found in memory.pairs:
             self._pairs[id(a.gray), id(b.gray)] = ((a.gray, b.gray), found)
 
+    def forget(self) -> None:
+        """Nothing is kept of images and pairs, but of a map's keyframes; the networks stay."""
+        with self._one_at_a_time:
+            self._seen.clear()
+            self._pairs.clear()
+            self._neighbours.clear()
+
     def _agreeing(
         self, ref: Array, new: Array, ref_moving: Array | None, new_moving: Array | None, rows: Rows
     ) -> tuple[FeatureMatches, float]:

@@ -107,7 +107,8 @@ class CovisibilityEdges:
 
     def _support(self, graph: KeyframeGraph, kf: Keyframe, pairs: Sequence[int]) -> None:
         """Edges of a new keyframe from sparse features, nearest first, until enough of it is seen elsewhere."""
-        shares = {k: _share(graph, kf.id, k) for k in pairs}
+        own = {e.j: e for e in graph.edges if e.i == kf.id}
+        shares = {k: matched_share(kf, own[k].weight) if k in own else 0.0 for k in pairs}
         for k in pairs:
             if sum(shares.values()) >= ENOUGH_SHARE:
                 return
