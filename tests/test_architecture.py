@@ -47,6 +47,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
         "export",
         "networks",
     ),
+    ("tasks",),  # what bench and batch run by: it knows run folders (export), and nothing of what runs
     ("parts", "experiments", "viewer", "metric"),
     ("tracking",),
     ("offline",),

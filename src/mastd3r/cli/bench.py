@@ -37,9 +37,9 @@ def bench_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _bench(args: argparse.Namespace, console: Console) -> int:
-    from ..experiments.execute import limits
     from ..experiments.store import Store
     from ..experiments.suite import entries_of, load_suite, sequences_of
+    from ..tasks.processes import limits
 
     suite = load_suite(args.suite)
     allowed = limits(args.jobs, args.memory_mib)

@@ -69,6 +69,19 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
         return folder
 
 
+def claim_shelf(folder: Path, mark: str, said: str, inputs: Sequence[Path] = ()) -> None:
+    """Make a folder ready that holds many runs, each in a folder of its own: an empty one, or one with ``mark`` in it.
+
+    ``said``: what ``mark`` is a sign of. Raises OutputError for a folder with other files, one that holds an input
+    or lies in one, and whatever the system refuses.
+    """
+    with writing(folder):
+        refuse_inputs(folder, inputs)
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()) and not (folder / mark).exists():
+            raise OutputError(f"{folder}: expected an empty folder or {said}, got one with other files; {ANOTHER}")
+
+
 def settle(folder: Path, *, also_incomplete: bool = False) -> None:
     """Let the complete run in ``unfinished`` take the place of the one before; nothing where there is none.
 

@@ -1,0 +1,167 @@
+"""What ``mastd3r batch`` does: a run of each of many sources, some at once, each in a folder of its own."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+
+from ..errors import ConfigError, InputError
+from ..metric.spec import absolute
+from .options import config_from_args, path
+from .screen import screen
+
+if TYPE_CHECKING:
+    from collections import Counter
+
+    from ..tasks.batch import Batch
+    from ..tasks.processes import Limits
+    from ..tasks.runner import Change
+
+EXIT_FAULT = 1  # as main.py
+RETRIES = 2
+OWN = ("quiet", "overwrite")  # options of run that batch takes itself
+
+
+def task_options(p: argparse.ArgumentParser) -> None:
+    """How many tasks run at once, and where."""
+    p.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="at once, each on its share of the cores (default: as many as cores and memory allow)",
+    )
+    p.add_argument("--memory-mib", type=float, metavar="M", help="for all of them (default: 80 %% of the machine's)")
+    p.add_argument(
+        "--retries",
+        type=int,
+        default=RETRIES,
+        metavar="N",
+        help=f"more attempts at what was killed (default {RETRIES})",
+    )
+
+
+def batch_parser(p: argparse.ArgumentParser, of_run: Sequence[argparse.Action]) -> None:
+    """Fill in the parser of ``batch``; ``of_run``: the options that it shares with ``run``."""
+    p.add_argument(
+        "sources",
+        type=path,
+        nargs="+",
+        metavar="LIST",
+        help="text file with a source a line, folder of videos, or sources",
+    )
+    p.add_argument("--out", type=path, required=True, help="folder for batch.json and a run folder a source")
+    task_options(p)
+    p.set_defaults(act=_batch, maps=None, of_run=of_run)
+
+
+def options_of(args: argparse.Namespace, of_run: Sequence[argparse.Action]) -> list[str]:
+    """What was said of run's options, as words that mean the same from any folder. Raises ConfigError, InputError."""
+    config_from_args(args)  # before anything starts
+    words = []
+    for action in of_run:
+        value = getattr(args, action.dest)
+        if action.dest in OWN or value in (None, False, []):
+            continue
+        option = action.option_strings[-1]
+        if value is True:
+            words.append(option)
+            continue
+        for one in value if isinstance(value, list) else [value]:
+            said = absolute(one) if action.dest == "scale" else os.path.abspath(one) if isinstance(one, Path) else one
+            words.append(f"{option}={said}")
+    return words
+
+
+def _batch(args: argparse.Namespace, console: Console) -> int:
+    from ..tasks.batch import Batch, sources_of
+    from ..tasks.lock import alone_in
+
+    options = options_of(args, args.of_run)
+    allowed = limits_of(args)
+    sources, twice = sources_of(args.sources)
+    said = Said(console, quiet=args.quiet)
+    batch = Batch(args.out, sources, options, overwrite=args.overwrite)
+    for line in twice:
+        said.line(line)
+    with alone_in(args.out, "batch") as lock:
+        _run(batch, allowed, lock, args.retries, said)
+    states = batch.states()
+    screen().print(
+        f"{states['complete']} of {states.total()} runs complete, see {batch.out / 'batch.json'}", soft_wrap=True
+    )
+    failed = [run for run in batch.runs.values() if run.state != "complete"]
+    if not failed:
+        return 0
+    if any(run.exit_code == EXIT_FAULT for run in failed):
+        return EXIT_FAULT
+    more = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
+    raise InputError(f"batch: expected every run to be complete, got {failed[0].name} failed{more}: {failed[0].reason}")
+
+
+def limits_of(args: argparse.Namespace) -> Limits:
+    """What the options say of how much may run at once. Raises ConfigError."""
+    from ..export.machine import usable_cores
+    from ..tasks.processes import limits
+
+    if args.retries < 0:
+        raise ConfigError(f"--retries: expected 0 or more, got {args.retries}")
+    return limits(usable_cores() if args.jobs is None else args.jobs, args.memory_mib)
+
+
+def _run(batch: Batch, allowed: Limits, lock: int | None, retries: int, said: Said) -> None:
+    from ..tasks.processes import Processes
+    from ..tasks.runner import run_tasks
+
+    tasks = batch.missing()
+    kept = len(batch.runs) - len(tasks)
+    said.line(
+        f"{len(tasks)} of {len(batch.runs)} runs to do{f', {kept} complete before' if kept else ''}; at most "
+        f"{allowed.jobs} at once, within {allowed.memory_mib:.0f} MiB"
+    )
+    for name, need_mib in batch.needs(tasks).items():
+        if need_mib > allowed.memory_mib:
+            got = f"{allowed.memory_mib:.0f}"
+            raise ConfigError(f"--memory-mib: expected {need_mib:.0f} or more, which {name} may need, got {got}")
+
+    def changed(change: Change) -> None:
+        run = batch.note(change)
+        said.change(run.name, change, batch.states())
+
+    try:
+        run_tasks(tasks, Processes(allowed, lock), batch.needs, changed, retries=retries)
+    finally:
+        batch.stop()
+
+
+class Said:
+    """A line a change, on a terminal and where output goes to a file."""
+
+    def __init__(self, console: Console, *, quiet: bool) -> None:
+        self._console, self._quiet = console, quiet
+
+    def line(self, text: str) -> None:
+        """One line."""
+        if not self._quiet:
+            self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def change(self, name: str, change: Change, states: Counter[str]) -> None:
+        """What has become of a task, and how many are how far."""
+        node = f" on {change.node}" if change.node else ""
+        tried = f" (attempt {change.attempt})" if change.attempt > 1 else ""
+        ended = change.ended
+        if ended is None:
+            what = f"started{node}{tried}"
+        elif ended.exit_code == 0:
+            peak = "" if ended.peak_mib is None else f", {ended.peak_mib:.0f} MiB"
+            what = f"complete in {ended.wall_s:.0f} s{peak}{tried}"
+        elif change.state == "again":
+            what = f"{ended.reason}{node}; to be tried again"
+        else:
+            what = f"failed{node}{tried}: {ended.reason}"
+        of = states.total()
+        self.line(f"[{states['complete'] + states['failed']}/{of}] {name}: {what}")
