@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from collections import Counter
 
     from ..tasks.batch import Batch
-    from ..tasks.processes import Limits
+    from ..tasks.cluster import Cluster
+    from ..tasks.processes import Limits, Processes
     from ..tasks.runner import Change
 
 EXIT_FAULT = 1  # as main.py
@@ -42,6 +43,17 @@ def task_options(p: argparse.ArgumentParser) -> None:
         default=RETRIES,
         metavar="N",
         help=f"more attempts at what was killed (default {RETRIES})",
+    )
+
+    ray_options(p)
+
+
+def ray_options(p: argparse.ArgumentParser) -> None:
+    """Where tasks run, if not here."""
+    p.add_argument("--ray", metavar="auto|HOST:PORT|local", help="on the nodes of a Ray cluster that share --out")
+    p.add_argument("--task-cores", type=int, metavar="N", help="with --ray: cores that a task asks for (default 2)")
+    p.add_argument(
+        "--task-gpus", type=float, metavar="G", help="with --ray: accelerators (default 1 where a node has one, else 0)"
     )
 
 
@@ -89,7 +101,7 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     for line in twice:
         said.line(line)
     with alone_in(args.out, "batch") as lock:
-        _run(batch, allowed, lock, args.retries, said)
+        _run(batch, allowed, lock, args, said)
     states = batch.states()
     screen().print(
         f"{states['complete']} of {states.total()} runs complete, see {batch.out / 'batch.json'}", soft_wrap=True
@@ -103,37 +115,66 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     raise InputError(f"batch: expected every run to be complete, got {failed[0].name} failed{more}: {failed[0].reason}")
 
 
+def place_for(args: argparse.Namespace, shared: Path, lock: int | None) -> Processes | Cluster:
+    """Where the options say that tasks run; ``shared``: a folder that nodes of a cluster see too.
+
+    Raises ConfigError, and what ``Cluster`` raises.
+    """
+    from ..tasks.processes import Processes
+
+    if args.ray is None:
+        return Processes(limits_of(args), lock)
+    return cluster_for(args, shared)
+
+
+def cluster_for(args: argparse.Namespace, shared: Path) -> Cluster:
+    """The cluster that ``--ray`` names. Raises what ``Cluster`` raises."""
+    from ..tasks.cluster import Asked, Cluster
+
+    return Cluster(args.ray, shared, Asked(args.task_cores, args.task_gpus), args.jobs)
+
+
 def limits_of(args: argparse.Namespace) -> Limits:
-    """What the options say of how much may run at once. Raises ConfigError."""
+    """What the options say of how much may run at once on this machine. Raises ConfigError."""
     from ..export.machine import usable_cores
     from ..tasks.processes import limits
 
     if args.retries < 0:
         raise ConfigError(f"--retries: expected 0 or more, got {args.retries}")
+    check_ray_options(args)
     return limits(usable_cores() if args.jobs is None else args.jobs, args.memory_mib)
 
 
-def _run(batch: Batch, allowed: Limits, lock: int | None, retries: int, said: Said) -> None:
-    from ..tasks.processes import Processes
+def check_ray_options(args: argparse.Namespace) -> None:
+    """Raises ConfigError for an option that says nothing where tasks run."""
+    if args.ray is None and (args.task_cores, args.task_gpus) != (None, None):
+        raise ConfigError("--task-cores, --task-gpus: expected --ray with them, got none; --jobs shares this machine")
+    if args.ray is not None and args.memory_mib is not None:
+        raise ConfigError("--memory-mib: expected tasks on this machine, got --ray; nodes have memory of their own")
+
+
+def _run(batch: Batch, allowed: Limits, lock: int | None, args: argparse.Namespace, said: Said) -> None:
+    from ..tasks.batch import LOGS
     from ..tasks.runner import run_tasks
 
     tasks = batch.missing()
     kept = len(batch.runs) - len(tasks)
-    said.line(
-        f"{len(tasks)} of {len(batch.runs)} runs to do{f', {kept} complete before' if kept else ''}; at most "
-        f"{allowed.jobs} at once, within {allowed.memory_mib:.0f} MiB"
-    )
+    said.line(f"{len(tasks)} of {len(batch.runs)} runs to do{f', {kept} complete before' if kept else ''}")
+    if not tasks:
+        return
     for name, need_mib in batch.needs(tasks).items():
-        if need_mib > allowed.memory_mib:
+        if need_mib > allowed.memory_mib and args.ray is None:
             got = f"{allowed.memory_mib:.0f}"
             raise ConfigError(f"--memory-mib: expected {need_mib:.0f} or more, which {name} may need, got {got}")
+    place = place_for(args, batch.out / LOGS, lock)
+    said.line(place.said)
 
     def changed(change: Change) -> None:
         run = batch.note(change)
         said.change(run.name, change, batch.states())
 
     try:
-        run_tasks(tasks, Processes(allowed, lock), batch.needs, changed, retries=retries)
+        run_tasks(tasks, place, batch.needs, changed, retries=args.retries)
     finally:
         batch.stop()
 

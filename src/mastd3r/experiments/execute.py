@@ -49,7 +49,7 @@ def run_entries(
 
     def task_of(entry: Entry) -> Task:
         def argv(attempt: int) -> list[str]:
-            return launch(entry, folders[entry.sequence.name], _fresh(store.run_folder(entry)))
+            return launch(entry, folders[entry.sequence.name].absolute(), _fresh(store.run_folder(entry).absolute()))
 
         return Task(entry.id, argv, store.runs / f"{entry.id}.log", store.run_folder(entry))
 

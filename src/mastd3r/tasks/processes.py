@@ -50,6 +50,7 @@ class Processes:
         """``lock``: an open file that tasks keep open too, so that what it locks stays locked while one runs."""
         self.allowed = allowed
         self._inherits = () if lock is None else (lock,)
+        self.said = f"at most {allowed.jobs} at once, within {allowed.memory_mib:.0f} MiB"
         self._running: list[_Running] = []
         self._new: list[Task] = []
 
