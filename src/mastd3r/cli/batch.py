@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +19,7 @@ from .screen import screen
 if TYPE_CHECKING:
     from collections import Counter
 
+    from ..offline.segmented import Segments
     from ..tasks.batch import Batch
     from ..tasks.cluster import Cluster
     from ..tasks.processes import Limits, Processes
@@ -55,6 +57,17 @@ def ray_options(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "--task-gpus", type=float, metavar="G", help="with --ray: accelerators (default 1 where a node has one, else 0)"
     )
+
+
+def segment_options(p: argparse.ArgumentParser) -> None:
+    """A long video in pieces, and where those are tracked."""
+    p.add_argument(
+        "--segment-frames",
+        type=int,
+        metavar="N",
+        help="track pieces of N frames by tasks of their own, and join them (default: where memory needs it)",
+    )
+    task_options(p)
 
 
 def batch_parser(p: argparse.ArgumentParser, of_run: Sequence[argparse.Action]) -> None:
@@ -125,6 +138,15 @@ def place_for(args: argparse.Namespace, shared: Path, lock: int | None) -> Proce
     if args.ray is None:
         return Processes(limits_of(args), lock)
     return cluster_for(args, shared)
+
+
+def segments_of(args: argparse.Namespace) -> Segments:
+    """How the options of ``run`` cut a long video. Raises ConfigError."""
+    from ..offline.segmented import Segments
+
+    limits_of(args)
+    elsewhere = None if args.ray is None else partial(cluster_for, args)
+    return Segments(args.segment_frames, args.jobs, args.memory_mib, args.retries, elsewhere)
 
 
 def cluster_for(args: argparse.Namespace, shared: Path) -> Cluster:

@@ -16,7 +16,7 @@ from ..metric.spec import FORMS
 from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
-from .batch import batch_parser
+from .batch import batch_parser, segment_options
 from .bench import bench_parser
 from .compile import PARTS, compile_kernels
 from .download import download_parser
@@ -151,7 +151,9 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=path, required=True, help="run folder")
     p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
     _run_options(p)
+    segment_options(p)
     p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs that are tasks
+    p.add_argument("--segment", action="store_true", help=argparse.SUPPRESS)  # one of those that --segment-frames makes
     p.set_defaults(act=commands.run)
 
 

@@ -26,9 +26,11 @@ FOLDERS = ("masks", "renders", "alpha", "depth")
 RECORDED, RECORDED_LIST = "recorded", "rgb.txt"  # frames of a live run, which nobody can take again
 RECORD_FILE, RESERVE = "run.json", ".reserve"
 CHECKPOINT = "checkpoint"  # folder of a run that goes on, or was stopped
+SEGMENTS = "segments"  # folder of a run whose pieces are tracked apart: PLAN/NUMBER, a run folder each
 UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
 MOVING = ".moving"  # in it: what the earlier one had more of is gone
 PICTURE = re.compile(r"-?\d+\.\d{6}\.png(\.part)?")  # as a run names them; others in its folders are not ours
+SEGMENT_FILE = re.compile(r"config\.yaml|\.shared|\.lock|\d+\.(log|node)")  # beside the pieces
 RECORD = {"status": str, "command": list, "machine": dict, "choices": list, "timings_s": dict}  # of our run.json
 ANOTHER = "choose another folder with --out"
 
@@ -60,6 +62,8 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
         settle(folder)
         if not overwrite:
             _refuse_recorded(folder)
+        if overwrite:
+            remove_segments(folder)
         _remove_run(unfinished)
         if (folder / "trajectory.txt").is_file() and not overwrite:
             folder = unfinished
@@ -125,6 +129,20 @@ def _remove_run(folder: Path) -> None:
             path.rmdir()
 
 
+def remove_segments(folder: Path) -> None:
+    """Remove the pieces of a run that were tracked apart: nothing of them is needed any more. Raises OSError."""
+    for plan in (folder / SEGMENTS).glob("*"):
+        for path in sorted(plan.glob("*")):
+            if path.is_dir() and path.name.isdigit():
+                _remove_run(path)
+            elif SEGMENT_FILE.fullmatch(path.name):
+                path.unlink()
+        with suppress(OSError):
+            plan.rmdir()
+    with suppress(OSError):
+        (folder / SEGMENTS).rmdir()
+
+
 def _pictures(folder: Path) -> list[Path]:
     return [p for p in folder.iterdir() if PICTURE.fullmatch(p.name)] if folder.is_dir() else []
 
@@ -174,7 +192,7 @@ def _refuse_recorded(folder: Path) -> None:
 
 
 def _refuse_links(folder: Path) -> None:
-    for name in (*FILES, *FOLDERS, RECORDED, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT):
+    for name in (*FILES, *FOLDERS, RECORDED, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT, SEGMENTS):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: expected a file or folder of a run, got a symbolic link; {ANOTHER}")
 

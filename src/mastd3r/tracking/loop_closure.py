@@ -169,11 +169,13 @@ def _loop(two_view: TwoViewEstimator, i: int, j: int, there: TwoView | None, bac
     return _Seen(Loop(i, j, j_from_i, float(better.weight.sum())), there, back, drift)
 
 
-def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
+def add_covisible_pairs(
+    graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int], most: int = COVISIBLE_PAIRS
+) -> int:
     """Match all pairs of keyframes that should see the same by their poses and were not matched before; how many.
 
     While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time holds
-    the chain together across them. At most ``COVISIBLE_PAIRS`` a keyframe, those that share most first.
+    the chain together across them. At most ``most`` a keyframe, those that share most first.
     """
     ids = graph.members()
     done = graph.connected_pairs()
@@ -186,6 +188,6 @@ def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int,
             motion = max(shared[i][1][b], shared[j][1][a])
             if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION and frozenset((i, j)) not in done:
                 pairs.append((-share, j, i))
-    made = connect([(i, j) for _, i, j in sorted(pairs)[: COVISIBLE_PAIRS * len(ids)]])
+    made = connect([(i, j) for _, i, j in sorted(pairs)[: most * len(ids)]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made
