@@ -3,8 +3,9 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, corrections.json, networks.json, reference.json, masks.json, dense.json,
-live.json, localise.json, metric_scale.json, speed.json, stress.json, and in bench/ the results.json of each bench
-under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside it.
+live.json, localise.json, metric_scale.json, segments.json, speed.json, stress.json, and in bench/ the results.json of
+each bench under its suite's name. Plots go into a folder plots beside the page, the curve of the stress suite beside
+it.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from map_tables import map_sections
 from masks_tables import masks
 from metric_table import metric_scale
 from networks_table import networks
+from segments_table import segments
 from speed_table import speed
 from splats_table import splats
 from stress_table import PICTURE, stress
@@ -93,6 +95,7 @@ def main() -> int:
     lines += metric_scale(source.parent / "metric_scale.json")
     lines += speed(source.parent / "speed.json")
     lines += live(source.parent / "live.json")
+    lines += segments(source.parent / "segments.json")
     lines += localise(source.parent / "localise.json")
     lines += [*endurance(source.parent / "endurance.json"), *reference(source.parent / "reference.json")]
     lines += corrections(source.parent / "corrections.json")

@@ -106,6 +106,7 @@ def test_what_a_command_took_is_known(tmp_path: Path) -> None:
 
 def test_ended_says_why() -> None:
     assert Ended(None, "node x is lost", 1.0).killed and Ended(None, "node x is lost", 1.0).reason == "node x is lost"
+    assert Ended(-15, "", 1.0).killed and Ended(130, "mastd3r: stopped; what was", 1.0).killed
     assert not Ended(3, "", 1.0).killed and Ended(3, "", 1.0).reason == "exit code 3 and no message"
 
 

@@ -9,13 +9,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from mastd3r.cli.main import main
+from mastd3r.config import Config
 from mastd3r.errors import InputError
+from mastd3r.offline import segmented
+from mastd3r.offline.segmented import Segments
+from mastd3r.pipeline import reconstruct
+from mastd3r.sources import synthetic
 from mastd3r.tasks.cluster import MARK, Asked
 from mastd3r.tasks.cluster import Cluster as Place
 from mastd3r.tasks.runner import Task, run_tasks
@@ -120,3 +126,17 @@ def test_a_cluster_that_is_not_there_is_one_line(tmp_path: Path, capsys: pytest.
     assert main([*words, "nowhere"]) == 2
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mastd3r: ")]
     assert len(said) == 3 and "no answer" in said[0] and "no answer within" in said[1] and "HOST:PORT" in said[2]
+
+
+def test_segments_on_a_cluster(tmp_path: Path, cluster: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synthetic, "CLIP_FPS", 10.0)
+    monkeypatch.setattr(segmented, "LEAST_FRAMES", 10)
+    monkeypatch.setattr(segmented, "OVERLAP_FRAMES", 10)
+    clip = synthetic.make_room_clip(tmp_path / "room", frames=60, width=160, height=120)
+    out = tmp_path / "run"
+    pieces = Segments(25, elsewhere=lambda folder: Place(cluster.address, folder, Asked(cores=1)))
+    config = replace(Config(), mapping=replace(Config().mapping, enabled=False))
+    run = reconstruct(clip, out, config, segments=pieces)
+    record = json.loads((out / "run.json").read_text())
+    assert run.metrics["frames_tracked"] == 60 and len(record["segments"]["joints"]) == 1
+    assert not (out / "segments").exists()

@@ -301,6 +301,8 @@ def _track_all(slam: Slam, job: RunJob, segments: Segments | None, *, track_only
     """All frames that were not tracked before, at once or in pieces, and what follows the last."""
     pieces = None if segments is None else cut(slam.config, slam.source.length, segments)
     if pieces is None or segments is None:
+        if segments is not None and segments.elsewhere is not None:
+            log.warning("the video stays whole, so there is nothing for other machines to do: see --segment-frames")
         _track(slam, job, job.frames)
     else:
         _track_apart(slam, job, pieces, segments)

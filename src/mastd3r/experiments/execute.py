@@ -48,10 +48,12 @@ def run_entries(
     by_id = {entry.id: entry for entry in entries}
 
     def task_of(entry: Entry) -> Task:
-        def argv(attempt: int) -> list[str]:
-            return launch(entry, folders[entry.sequence.name].absolute(), _fresh(store.run_folder(entry).absolute()))
+        run = store.run_folder(entry).absolute()
 
-        return Task(entry.id, argv, store.runs / f"{entry.id}.log", store.run_folder(entry))
+        def argv(attempt: int) -> list[str]:
+            return launch(entry, folders[entry.sequence.name].absolute(), _fresh(run))
+
+        return Task(entry.id, argv, run.with_name(f"{entry.id}.log"), run)
 
     def changed(change: Change) -> None:
         if change.ended is not None:

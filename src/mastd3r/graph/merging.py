@@ -124,6 +124,8 @@ def _shared(
     graph: KeyframeGraph, before: list[FrameRecord], after: list[FrameRecord]
 ) -> dict[tuple[int, int], list[tuple[FrameRecord, FrameRecord]]]:
     """Frames that both have tracked, by their submaps; without those that are in one already."""
+    if not before or not after or before[-1].index < after[0].index:
+        return {}
     first = {r.index: r for r in before if r.state in MEASURED}
     pairs: dict[tuple[int, int], list[tuple[FrameRecord, FrameRecord]]] = {}
     for r in after:

@@ -143,7 +143,8 @@ class Batch:
         A run that is complete under the same words is kept, unless ``overwrite``. Raises OutputError, before anything
         is written, for a folder with other files.
         """
-        self.out, self.options, self.overwrite, self._program = out, list(options), overwrite, list(program)
+        self.out, self.options = Path(os.path.abspath(out)), list(options)
+        self.overwrite, self._program = overwrite, list(program)
         claim_shelf(out, RECORD, "an earlier batch", sources)
         before = _earlier(out / RECORD)
         names = names_for(sources, {run["source"]: run["name"] for run in before})
@@ -211,8 +212,16 @@ class Batch:
         return Task(run.name, argv, self.out / LOGS / f"{run.name}.log", self.out / run.name)
 
     def _words(self, run: SourceRun) -> list[str]:
-        out = os.path.abspath(self.out / run.name)
-        return ["mastd3r", "run", run.source, "--out", out, *self.options, "--quiet", "--end-with-stdin"]
+        return [
+            "mastd3r",
+            "run",
+            run.source,
+            "--out",
+            str(self.out / run.name),
+            *self.options,
+            "--quiet",
+            "--end-with-stdin",
+        ]
 
     def _is_complete(self, run: SourceRun) -> bool:
         """Whether the folder holds what this very command leaves."""

@@ -194,7 +194,7 @@ class Cluster:
 
     def _largest_mib(self, nodes: list[dict[str, float]]) -> float | None:
         """Memory of the largest node that has the cores and the accelerator; None where none has."""
-        fit = [n for n in nodes if n.get("CPU", 0) >= self.cores and n.get("GPU", 0) >= min(self.gpus, 1e9)]
+        fit = [n for n in nodes if n.get("CPU", 0) >= self.cores and n.get("GPU", 0) >= self.gpus]
         return max((n.get("memory", 0.0) / 2**20 for n in fit), default=None)
 
     def _wanted(self) -> str:

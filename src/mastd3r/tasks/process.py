@@ -16,6 +16,7 @@ from ..export.files import writing
 LOG_END_BYTES = 2**16  # of what a command has said, its last line is looked for in
 END_S = 20.0  # for a run to save what it has, once it is told to stop
 POLL_S = 0.1
+STOPPED = 130  # exit code of a command that was told to stop
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Ended:
     @property
     def killed(self) -> bool:
         """True where it did not end by itself, so that the same command may well succeed."""
-        return self.exit_code is None or self.exit_code < 0
+        return self.exit_code is None or self.exit_code < 0 or self.exit_code == STOPPED
 
     @property
     def reason(self) -> str:

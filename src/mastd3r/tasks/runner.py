@@ -85,9 +85,11 @@ def run_tasks(
                 at_once |= {name: max(at_once.get(name, 0), len(running)) for name in running}
                 changed(Change(task, "started", attempts[task.name], node=node))
             for task, ended in place.ended():
+                attempt = attempts[task.name]
+                if task.name not in running:  # so quick that nobody saw it begin
+                    changed(Change(task, "started", attempt, node=ended.node))
                 given.discard(task.name)
                 running.discard(task.name)
-                attempt = attempts[task.name]
                 again = ended.killed and attempt <= retries
                 if again:
                     waiting.appendleft(task)
