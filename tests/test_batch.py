@@ -14,7 +14,8 @@ import pytest
 
 from mastd3r.cli.main import main
 from mastd3r.errors import InputError, OutputError
-from mastd3r.tasks.batch import MEMORY_MIB, Batch, names_for, sources_of
+from mastd3r.tasks import lock as lock_module
+from mastd3r.tasks.batch import MEMORY_MIB, Batch, claim_batch, names_for, sources_of
 from mastd3r.tasks.process import Ended
 from mastd3r.tasks.processes import Limits, Processes
 from mastd3r.tasks.runner import Change, Task, run_tasks
@@ -164,6 +165,7 @@ def test_names_are_safe_each_once_and_kept() -> None:
 def batch_of(tmp_path: Path, *options: str, names: tuple[str, ...] = ("a", "b"), overwrite: bool = False) -> Batch:
     sources = [tmp_path / "in" / name for name in names]
     program = [sys.executable, "-c", RUN]
+    claim_batch(tmp_path / "out", sources)
     return Batch(tmp_path / "out", sources, options, overwrite=overwrite, program=program)
 
 
@@ -222,7 +224,7 @@ def test_a_folder_is_for_one_batch_and_nothing_else(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match="expected that of an earlier batch"):
         batch_of(tmp_path)
     with pytest.raises(OutputError, match="expected a folder outside what is read"):
-        Batch(tmp_path / "in" / "a" / "out", [tmp_path / "in" / "a"], [])
+        claim_batch(tmp_path / "in" / "a" / "out", [tmp_path / "in" / "a"])
     mine = {"made_by": "mastd3r batch", "runs": [{"name": "../../etc", "source": "x", "state": "complete"}, 7]}
     (tmp_path / "out" / "batch.json").write_text(json.dumps(mine))
     assert list(batch_of(tmp_path).runs) == ["a", "b"]
@@ -247,6 +249,20 @@ def test_bad_input_is_one_line_and_starts_nothing(tmp_path: Path, capsys: pytest
         err = capsys.readouterr().err.splitlines()
         assert said in err[-1] and len([line for line in err if line.startswith("mastd3r: ")]) == 1
     assert not (tmp_path / "out" / "a").exists()
+
+
+def test_a_second_batch_in_the_folder_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fcntl")
+    monkeypatch.setattr(lock_module, "LOCK_WAIT_S", 0.3)
+    (tmp_path / "a.mp4").touch()
+    words = ["batch", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "out"), "--no-map"]
+    (tmp_path / "out").mkdir()
+    with lock_module.alone_in(tmp_path / "out", "batch"):
+        assert main(words) == 2
+    assert "expected no other batch at work in it" in capsys.readouterr().err
+    assert not (tmp_path / "out" / "batch.json").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")

@@ -103,17 +103,18 @@ def options_of(args: argparse.Namespace, of_run: Sequence[argparse.Action]) -> l
 
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
-    from ..tasks.batch import Batch, sources_of
+    from ..tasks.batch import Batch, claim_batch, sources_of
     from ..tasks.lock import alone_in
 
     options = options_of(args, args.of_run)
     allowed = limits_of(args)
     sources, twice = sources_of(args.sources)
     said = Said(console, quiet=args.quiet)
-    batch = Batch(args.out, sources, options, overwrite=args.overwrite)
     for line in twice:
         said.line(line)
+    claim_batch(args.out, sources)
     with alone_in(args.out, "batch") as lock:
+        batch = Batch(args.out, sources, options, overwrite=args.overwrite)
         _run(batch, allowed, lock, args, said)
     states = batch.states()
     screen().print(

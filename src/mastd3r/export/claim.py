@@ -26,6 +26,7 @@ FOLDERS = ("masks", "renders", "alpha", "depth")
 RECORDED, RECORDED_LIST = "recorded", "rgb.txt"  # frames of a live run, which nobody can take again
 RECORD_FILE, RESERVE = "run.json", ".reserve"
 CHECKPOINT = "checkpoint"  # folder of a run that goes on, or was stopped
+LOCK = ".lock"  # of a folder that many runs are written in, while a command is at work there
 SEGMENTS = "segments"  # folder of a run whose pieces are tracked apart: PLAN/NUMBER, a run folder each
 UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
 MOVING = ".moving"  # in it: what the earlier one had more of is gone
@@ -82,7 +83,7 @@ def claim_shelf(folder: Path, mark: str, said: str, inputs: Sequence[Path] = ())
     with writing(folder):
         refuse_inputs(folder, inputs)
         folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()) and not (folder / mark).exists():
+        if any(p.name != LOCK for p in folder.iterdir()) and not (folder / mark).exists():
             raise OutputError(f"{folder}: expected an empty folder or {said}, got one with other files; {ANOTHER}")
 
 

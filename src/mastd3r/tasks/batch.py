@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError, OutputError
-from ..export.claim import RECORD_FILE, UNFINISHED, claim_shelf
+from ..export.claim import RECORD_FILE, claim_shelf
 from ..export.files import write_json, writing
 from ..reading.files import entries_of, is_file, resolved, user_path, whole_json, whole_text
 from ..registry import LARGEST
@@ -29,7 +29,7 @@ MEMORY_MIB = 1500.0  # of a run, while none of this batch has ended
 NETWORK_MIB = 6000.0  # the same with a network's pointmaps
 MORE_THAN_SEEN = 1.1  # the next run may need a little more than those that have ended
 MOST_NAME_BYTES = 100  # of a run's folder
-TAKEN = {RECORD, LOGS, UNFINISHED, ".lock"}
+TAKEN = {RECORD, LOGS}
 
 
 # -- which sources -----------------------------------------------------------------------------------------------
@@ -107,6 +107,11 @@ def _safe(text: str) -> str:
     return kept.encode()[:MOST_NAME_BYTES].decode("utf-8", "ignore").strip("._-")
 
 
+def claim_batch(out: Path, sources: Sequence[Path]) -> None:
+    """Make a folder ready for a batch. Raises OutputError, before anything is written, for one with other files."""
+    claim_shelf(out, RECORD, "an earlier batch", sources)
+
+
 # -- what is known of each ---------------------------------------------------------------------------------------
 
 
@@ -140,12 +145,11 @@ class Batch:
     ) -> None:
         """``options``: words of ``mastd3r run``, the same for all; ``program``: what makes words a process.
 
-        A run that is complete under the same words is kept, unless ``overwrite``. Raises OutputError, before anything
-        is written, for a folder with other files.
+        A run that is complete under the same words is kept, unless ``overwrite``. ``out`` has been claimed, and nobody
+        else is at work in it. Raises OutputError for a batch.json that is not ours.
         """
         self.out, self.options = Path(os.path.abspath(out)), list(options)
         self.overwrite, self._program = overwrite, list(program)
-        claim_shelf(out, RECORD, "an earlier batch", sources)
         before = _earlier(out / RECORD)
         names = names_for(sources, {run["source"]: run["name"] for run in before})
         self.runs = {names[s]: SourceRun(names[s], str(s)) for s in sources}

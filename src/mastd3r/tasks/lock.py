@@ -8,9 +8,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..errors import OutputError
+from ..export.claim import LOCK
 from ..export.files import writing
 
-LOCK = ".lock"
 LOCK_WAIT_S = 15.0  # tasks of a command that was killed end by themselves within seconds
 
 
