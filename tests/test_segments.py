@@ -23,7 +23,7 @@ from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.merging import join_at_overlaps, one_record_a_frame, side_by_side, with_lost_frames
 from mastd3r.offline import segmented
 from mastd3r.offline.segmented import LEAST_FRAMES, OVERLAP_FRAMES, Segments, cut
-from mastd3r.pipeline import reconstruct
+from mastd3r.pipeline import reconstruct, resume
 from mastd3r.sources import synthetic
 from mastd3r.tasks.processes import Limits, Processes
 from mastd3r.tasks.runner import Task
@@ -268,8 +268,9 @@ def test_segments_that_were_tracked_are_kept_for_the_same_command(clip: Path, tm
     with pytest.raises(InputError, match="got none: "):
         reconstruct(clip, out, NO_MAP, segments=Segments(25, elsewhere=NoneRuns))
     assert sorted(p.name for p in (first / "checkpoint").iterdir()) == before
-    run = reconstruct(clip, out, NO_MAP, segments=Segments(25))
-    assert run.metrics["frames_tracked"] == 60 and not (out / "segments").exists()
+    run = resume(out)  # run.json says that it was in segments
+    assert run.metrics["frames_tracked"] == 60 and len(record_of(out)["segments"]["joints"]) == 1
+    assert not (out / "segments").exists()
 
 
 class NoneRuns(Processes):

@@ -234,7 +234,7 @@ def _go_on(
                 if not (track_only and memory.stage == "tracked"):  # then there is no more to do
                     done = slam.go_on(memory, job)
             if memory is None and segments is None and (before := record.get("segments")):
-                segments = Segments(before["frames"])
+                segments = Segments(before.get("frames"))
             if memory is not None and track_only and memory.stage == "tracked":
                 folder.finish("incomplete", TRACKED)
             elif done is None:
