@@ -206,6 +206,7 @@ class Killing(Processes):
             self._running[-1].child.process.kill()
 
 
+LISTS = ("rgb.txt", "groundtruth.txt")
 NO_MAP = replace(Config(), mapping=MappingConfig(enabled=False))
 
 
@@ -296,3 +297,22 @@ def test_bad_options_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[
         err = capsys.readouterr().err
         assert said in err and err.count("mastd3r: ") == 1
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
+def test_a_segment_in_which_the_camera_stands_still_is_placed_by_the_others(clip: Path, tmp_path: Path) -> None:
+    """By itself it has no depth, and what it might make up would be wrong."""
+    longer = tmp_path / "clip"
+    (longer / "rgb").mkdir(parents=True)
+    rows = {n: [line.split() for line in (clip / n).read_text().splitlines() if line[0] != "#"] for n in LISTS}
+    images, poses = rows["rgb.txt"], rows["groundtruth.txt"]
+    for n in range(85):
+        (longer / "rgb" / f"{n:03d}.png").symlink_to(clip / images[min(n, 59)][1])
+    (longer / "rgb.txt").write_text("".join(f"{n / 10:.6f} rgb/{n:03d}.png\n" for n in range(85)))
+    truth = (" ".join([f"{n / 10:.6f}", *poses[min(n, 59)][1:]]) for n in range(85))
+    (longer / "groundtruth.txt").write_text("\n".join(truth) + "\n")
+    run = reconstruct(longer, tmp_path / "run", NO_MAP, segments=Segments(30))
+    record = record_of(tmp_path / "run")
+    assert [w[0] for w in record["segments"]["windows"]] == [0, 30, 60] and record["segments"]["failed"] == []
+    assert run.metrics["frames_tracked"] == 85 and run.metrics["ate_rmse_all"] < 0.03

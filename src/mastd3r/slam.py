@@ -201,7 +201,9 @@ class Slam:
         ``frames``: (index, seconds) of all; those that no piece has are lost, and not looked for once more.
         Raises InputError where no piece has any depth.
         """
-        joints = join_segments(self.graph, [s.graph for s in segments], self.keyframes.edges)
+        needs_motion = self.parts.provider.depth_sigma_ratio is None
+        graphs = [s.graph for s in segments]
+        joints = join_segments(self.graph, graphs, self.keyframes.edges, needs_motion=needs_motion)
         self._pairs = PAIRS_AFTER_JOINING
         self.masks.remember(segments[-1].mask)  # what it has learned of the looks of things
         known = {r.index for r in self.graph.records}

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 SAME_PX = 5.0  # between points of two graphs in one frame, for their depths to be compared
 MIN_POINTS = 20  # so compared, for a frame to speak of the scale
 MIN_FRAMES = 5  # that both graphs have tracked
-MAX_TURN, MAX_SHIFT = 0.03, 0.1  # rad, and of the median depth: the median of what shared frames disagree by
+MAX_TURN, MAX_SHIFT = 0.05, 0.1  # rad, and of the median depth: the median of what shared frames disagree by
 SAME_FOCAL = 0.003  # of its log: what differs by more is solved under the lens that all get
 NOTHING: dict[str, Any] = {
     "points": np.zeros(0, int),

@@ -11,22 +11,24 @@ from ..errors import InputError
 from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import KeyframeGraph
 from ..graph.merging import Merged, join_at_overlaps, one_record_a_frame, side_by_side
+from ..graph.turning import observed
 from .covisibility import CovisibilityEdges
 
 log = logging.getLogger(__name__)
 NEAREST = 3  # keyframes of the segment before that one in the overlap is matched with
 PAIRS_AFTER_JOINING = 2  # for each keyframe, of what is matched once more: within a segment that was done before
+NO_DEPTH = ("none", "rotation")  # what the matches of a segment may let be known, without any depth in it
 KERNEL_PX, ITERATIONS = 2.0, 5  # of the solve over all, once the segments are in one world
 
 
 def join_segments(
-    graph: KeyframeGraph, parts: Sequence[KeyframeGraph], edges: CovisibilityEdges
+    graph: KeyframeGraph, parts: Sequence[KeyframeGraph], edges: CovisibilityEdges, *, needs_motion: bool = True
 ) -> list[dict[str, Any]]:
     """``graph`` becomes what the ``parts`` are together: a world for all that share frames, edges across the overlaps.
 
     ``parts`` in order of time, each with what follows the last frame done (``Slam.end_tracking``). What was joined,
-    for run.json. What is not stays a submap: it is recognised later, or placed by continuity. Raises InputError where
-    no part has any depth.
+    for run.json. What is not stays a submap: it is recognised later, or placed by continuity. ``needs_motion``: depth
+    comes from the camera's motion. Raises InputError where no part has any depth.
     """
     for part in parts:
         if not part.started and len(part.members()) > 1:
@@ -36,6 +38,8 @@ def join_segments(
             f"segments: expected depth in one of them, got none in {len(parts)}; the camera may hardly move, or they "
             "are too short: try more --segment-frames"
         )
+    if needs_motion:
+        _doubt_still_ones(parts)
     merged = side_by_side(parts)
     joints = join_at_overlaps(merged)
     one_record_a_frame(merged)
@@ -48,6 +52,17 @@ def join_segments(
     graph.submap = min(graph.started)
     graph.solve_all(ITERATIONS, KERNEL_PX)
     return [asdict(joint) for joint in joints]
+
+
+def _doubt_still_ones(parts: Sequence[KeyframeGraph]) -> None:
+    """Structure of a part whose camera stands still or only turns is none: its frames are looked for in the others.
+
+    Where that is all parts, the joint optimisation says so.
+    """
+    still = [p for p in parts if p.started and len(p.roots()) == 1 and observed(p, p.members())[0].kind in NO_DEPTH]
+    if len(still) < sum(bool(part.started) for part in parts):
+        for part in still:
+            part.started.clear()
 
 
 def _across(merged: Merged, before: int, after: int) -> list[tuple[int, int]]:
