@@ -274,6 +274,23 @@ def test_segments_that_were_tracked_are_kept_for_the_same_command(clip: Path, tm
     assert not (out / "segments").exists()
 
 
+class Useless(Processes):
+    """Every task ends well and leaves nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(Limits(2, 4000))
+
+    def give(self, task: Task, attempt: int, need_mib: float) -> None:
+        super().give(replace(task, argv=lambda n: ["true"]), attempt, need_mib)
+
+
+@pytest.mark.usefixtures("short")
+def test_a_segment_that_left_nothing_is_named(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected what a segment leaves, written by version"):
+        reconstruct(clip, tmp_path / "run", NO_MAP, segments=Segments(25, elsewhere=Useless))
+    assert record_of(tmp_path / "run")["status"] == "incomplete"
+
+
 class NoneRuns(Processes):
     """Every task fails at once."""
 

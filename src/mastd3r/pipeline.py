@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .concurrency import one_blas_thread
 from .config import Config, check_config, config_from_yaml, config_to_yaml
-from .errors import InputError
+from .errors import ConfigError, InputError
 from .evaluation.evaluate import evaluate_trajectory as score
 from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
 from .export.run_folder import RunFolder
@@ -34,6 +34,7 @@ from .reading.files import is_file, resolved, user_path, whole_text
 from .reading.yaml_text import MOST_YAML_BYTES
 from .slam import Slam
 from .sources import open_source
+from .tracking.memory import can_remember
 from .types import Frame, Source
 
 Array = NDArray[Any]
@@ -318,6 +319,8 @@ def _track_all(slam: Slam, job: RunJob, segments: Segments | None, *, track_only
 
 def _track_apart(slam: Slam, job: RunJob, pieces: Cut, segments: Segments) -> None:
     """Pieces of the video by tasks of their own, joined here. run.json says which, and what became of them."""
+    if not can_remember(slam.masks):
+        raise ConfigError("segments: expected a filter of the mask that says what it remembers, got one that does not")
     folder, read = job.folder, job.folder.record["source"]
     folder.update(segments={"frames": pieces.frames, "windows": [[w.start, w.end] for w in pieces.windows]})
     folder.note(pieces.said)

@@ -115,7 +115,8 @@ def track_segments(
     """Track the pieces of a source (``read``: its path and that of the maps), each in a folder of ``run``.
 
     What an earlier command of the same words has tracked is there still. A piece that fails for good is left out.
-    Raises InputError where all of them are, OutputError, and what the place of the tasks raises.
+    Raises InputError where all of them are, or what one has left cannot be read; OutputError, and what the place of
+    the tasks raises.
     """
     own = replace(config, scale="", mapping=replace(config.mapping, enabled=False))
     text = config_to_yaml(replace(own, source=replace(config.source, start=0, end=None)))
@@ -167,12 +168,17 @@ def _read(tasks: list[Task], pieces: Cut, ends: dict[str, Change], processor_s: 
     for task, window in zip(tasks, pieces.windows, strict=True):
         ended = ends[task.name].ended
         assert ended is not None
-        memory = CheckpointStore(task.run / CHECKPOINT, program()).load() if ended.exit_code == 0 else None
-        if isinstance(memory, Memory) and memory.stage == "tracked":
-            found.append(memory.tracking)
-            frames += memory.job.frames
-        else:
-            failed.append((window, ended.reason if ended.exit_code else "its checkpoint cannot be read"))
+        if ended.exit_code != 0:
+            failed.append((window, ended.reason))
+            continue
+        memory = CheckpointStore(task.run / CHECKPOINT, program()).load()
+        if not isinstance(memory, Memory) or memory.stage != "tracked":
+            raise InputError(
+                f"{task.run}: expected what a segment leaves, written by version {program()}, got none that can be "
+                "read; the same command tracks it anew"
+            )
+        found.append(memory.tracking)
+        frames += memory.job.frames
     if not found:
         raise InputError(f"segments: expected one of {len(tasks)} to be tracked, got none: {failed[0][1]}")
     return TrackedApart(found, frames, processor_s, failed)
