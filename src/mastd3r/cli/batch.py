@@ -103,18 +103,20 @@ def options_of(args: argparse.Namespace, of_run: Sequence[argparse.Action]) -> l
 
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
-    from ..tasks.batch import Batch, claim_batch, sources_of
+    from ..parts import chosen_pointmaps
+    from ..tasks.batch import MEMORY_MIB, NETWORK_MIB, Batch, claim_batch, sources_of
     from ..tasks.lock import alone_in
 
     options = options_of(args, args.of_run)
     allowed = limits_of(args)
     sources, twice = sources_of(args.sources)
+    guess_mib = NETWORK_MIB if chosen_pointmaps(config_from_args(args))[0] == "mast3r" else MEMORY_MIB
     said = Said(console, quiet=args.quiet)
     for line in twice:
         said.line(line)
     claim_batch(args.out, sources)
     with alone_in(args.out, "batch") as lock:
-        batch = Batch(args.out, sources, options, overwrite=args.overwrite)
+        batch = Batch(args.out, sources, options, overwrite=args.overwrite, guess_mib=guess_mib)
         _run(batch, allowed, lock, args, said)
     states = batch.states()
     screen().print(

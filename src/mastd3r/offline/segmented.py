@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,9 @@ from ..export.checkpoint import CheckpointStore
 from ..export.claim import CHECKPOINT, SEGMENTS
 from ..export.files import write_text, writing
 from ..export.machine import program, total_memory_mib, usable_cores
+from ..parts import chosen_pointmaps
 from ..progress import Reporter
+from ..tasks.batch import NETWORK_MIB
 from ..tasks.lock import alone_in
 from ..tasks.processes import Processes, limits
 from ..tasks.runner import Change, Place, Task, run_tasks
@@ -104,7 +106,6 @@ class TrackedApart:
     """What the tasks have left."""
 
     segments: list[TrackingMemory]  # in order of time
-    frames: int  # that were tracked, those of the overlaps twice
     processor_s: float  # NaN where the system does not say
     failed: list[tuple[SourceConfig, str]]  # pieces that are missing, and why
 
@@ -137,7 +138,7 @@ def track_segments(
             log.info("%s", line)
             bar.say(line)
             if ended is not None:
-                spent[0] += ended.processor_s or float("nan")
+                spent[0] += float("nan") if ended.processor_s is None else ended.processor_s
             if change.state == "ended":
                 ends[change.task.name] = change
                 bar.advance()
@@ -145,7 +146,9 @@ def track_segments(
         with alone_in(folder, "run") as lock:
             here = limits(asked.jobs or usable_cores(), asked.memory_mib)
             place: Place = Processes(here, lock) if asked.elsewhere is None else asked.elsewhere(folder)
-            run_tasks(tasks, place, lambda them: _needs(them, pieces), changed, retries=asked.retries)
+            own_mib = NETWORK_MIB if chosen_pointmaps(config)[0] == "mast3r" else TRACKING_MIB
+            need_mib = own_mib + FRAME_MIB * (pieces.frames + OVERLAP_FRAMES)
+            run_tasks(tasks, place, lambda them: {t.name: need_mib for t in them}, changed, retries=asked.retries)
     return _read(tasks, pieces, ends, spent[0])
 
 
@@ -158,13 +161,8 @@ def _task(folder: Path, number: int, window: SourceConfig, read: dict[str, Any])
     return Task(name, lambda attempt: argv, folder / f"{name}.log", folder / name)
 
 
-def _needs(tasks: Collection[Task], pieces: Cut) -> dict[str, float]:
-    need = TRACKING_MIB + FRAME_MIB * (pieces.frames + OVERLAP_FRAMES)
-    return {task.name: need for task in tasks}
-
-
 def _read(tasks: list[Task], pieces: Cut, ends: dict[str, Change], processor_s: float) -> TrackedApart:
-    found, failed, frames = [], [], 0
+    found, failed = [], []
     for task, window in zip(tasks, pieces.windows, strict=True):
         ended = ends[task.name].ended
         assert ended is not None
@@ -178,7 +176,6 @@ def _read(tasks: list[Task], pieces: Cut, ends: dict[str, Change], processor_s: 
                 "read; the same command tracks it anew"
             )
         found.append(memory.tracking)
-        frames += memory.job.frames
     if not found:
         raise InputError(f"segments: expected one of {len(tasks)} to be tracked, got none: {failed[0][1]}")
-    return TrackedApart(found, frames, processor_s, failed)
+    return TrackedApart(found, processor_s, failed)

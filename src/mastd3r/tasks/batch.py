@@ -26,7 +26,7 @@ MOST_LIST_BYTES = 2**22
 RECORD, LOGS = "batch.json", "logs"
 MADE_BY = "mastd3r batch"
 MEMORY_MIB = 1500.0  # of a run, while none of this batch has ended
-NETWORK_MIB = 6000.0  # the same with a network's pointmaps
+NETWORK_MIB = 6000.0  # the same with a network's pointmaps, of any run
 MORE_THAN_SEEN = 1.1  # the next run may need a little more than those that have ended
 MOST_NAME_BYTES = 100  # of a run's folder
 TAKEN = {RECORD, LOGS}
@@ -141,15 +141,17 @@ class Batch:
         options: Sequence[str],
         *,
         overwrite: bool = False,
+        guess_mib: float = MEMORY_MIB,
         program: Sequence[str] = (sys.executable, "-m"),
     ) -> None:
-        """``options``: words of ``mastd3r run``, the same for all; ``program``: what makes words a process.
+        """``options``: words of ``mastd3r run``, the same for all; ``guess_mib``: what a run needs, while none of this
+        batch has ended; ``program``: what makes words a process.
 
         A run that is complete under the same words is kept, unless ``overwrite``. ``out`` has been claimed, and nobody
         else is at work in it. Raises OutputError for a batch.json that is not ours.
         """
         self.out, self.options = Path(os.path.abspath(out)), list(options)
-        self.overwrite, self._program = overwrite, list(program)
+        self.overwrite, self.guess_mib, self._program = overwrite, guess_mib, list(program)
         before = _earlier(out / RECORD)
         names = names_for(sources, {run["source"]: run["name"] for run in before})
         self.runs = {names[s]: SourceRun(names[s], str(s)) for s in sources}
@@ -173,8 +175,7 @@ class Batch:
 
     def needs(self, tasks: Collection[Task]) -> dict[str, float]:
         """MiB that runs need: a little more than the most that one of this batch has taken, else a guess."""
-        guess = NETWORK_MIB if any("mast3r" in word for word in self.options) else MEMORY_MIB
-        need = MORE_THAN_SEEN * max(self._seen_mib) if self._seen_mib else guess
+        need = MORE_THAN_SEEN * max(self._seen_mib) if self._seen_mib else self.guess_mib
         return {task.name: need for task in tasks}
 
     def note(self, change: Change) -> SourceRun:
