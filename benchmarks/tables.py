@@ -3,9 +3,9 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, endless.json, corrections.json, networks.json, reference.json, masks.json,
-dense.json, live.json, localise.json, metric_scale.json, profile.json, speed.json, stress.json, two_videos.json,
-and in bench/ the results.json of each bench under its suite's name. Plots go into a folder plots beside the page, the
-curve of the stress suite beside it.
+dense.json, live.json, localise.json, metric_scale.json, profile.json, segments.json, speed.json, stress.json,
+two_videos.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a folder plots
+beside the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from masks_tables import masks
 from metric_table import metric_scale
 from networks_table import networks
 from profile_table import profile
+from segments_table import segments
 from speed_table import speed
 from splats_table import splats
 from stress_table import PICTURE, stress
@@ -97,6 +98,7 @@ def main() -> int:
     lines += metric_scale(source.parent / "metric_scale.json")
     lines += [*speed(source.parent / "speed.json"), *profile(source.parent / "profile.json")]
     lines += live(source.parent / "live.json")
+    lines += segments(source.parent / "segments.json")
     lines += localise(source.parent / "localise.json")
     lines += two_videos(source.parent / "two_videos.json")
     lines += [*endurance(source.parent / "endurance.json"), *endless(source.parent / "endless.json")]

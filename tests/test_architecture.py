@@ -47,6 +47,7 @@ ROWS: tuple[tuple[str, ...], ...] = (
         "export",
         "networks",
     ),
+    ("tasks",),  # what bench and batch run by: it knows run folders (export), and nothing of what runs
     ("parts", "experiments", "viewer", "metric"),
     ("tracking",),
     ("offline",),
@@ -63,6 +64,7 @@ EXCEPTIONS = {
     ("config", "dynamics.config"): "the mask's options stand with the mask; config only joins them",
     ("export.machine", ""): "the version number of the package goes into run.json",
     ("cli.parser", ""): "the version number",
+    ("tasks.cluster", ""): "the version number: nodes must have the same",
     ("protocols", "alignment.problem"): "for type checkers alone: what an aligner is given",
     ("protocols", "alignment.result"): "for type checkers alone: what it gives back",
     ("protocols", "dynamics.data"): "for type checkers alone: what a mask is told, and is",
@@ -77,6 +79,7 @@ HEAVY = {  # package: who may import it
     "numba": {"geometry", "dynamics", "mapping", "pointmap", "mvs"},
     "rich": {"cli"},
     "viser": {"viewer"},  # the optional browser viewer
+    "ray": {"tasks"},  # optional clusters
 }
 # recordings are CUDA's; config: mapping.device; gsplat's backend
 NAMES_A_DEVICE = {"mapping.rasterise", "mapping.rasterise_gsplat", "networks.record", "config"}

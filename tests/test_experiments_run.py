@@ -14,10 +14,11 @@ from typing import Any
 import pytest
 
 from mastd3r.errors import ConfigError, OutputError
-from mastd3r.experiments import store as store_module
-from mastd3r.experiments.execute import Limits, by_command_line, limits, run_entries
+from mastd3r.experiments.execute import by_command_line, run_entries
 from mastd3r.experiments.store import Store, read_results, results_of, thinned
 from mastd3r.experiments.suite import Entry, SequenceSpec, entries_of, suite_from_dict
+from mastd3r.tasks import lock as lock_module
+from mastd3r.tasks.processes import Limits, limits
 
 SUITE = suite_from_dict(
     {
@@ -219,7 +220,7 @@ def test_a_folder_is_for_one_bench_and_nothing_else(tmp_path: Path, monkeypatch:
     with pytest.raises(OutputError, match="expected an empty folder or an earlier bench"):
         Store(tmp_path / "thesis").prepare()
     pytest.importorskip("fcntl")
-    monkeypatch.setattr(store_module, "LOCK_WAIT_S", 0.3)
+    monkeypatch.setattr(lock_module, "LOCK_WAIT_S", 0.3)
     store = Store(tmp_path / "out")
     store.prepare()
     with store.locked(), pytest.raises(OutputError, match="expected no other bench at work"), store.locked():

@@ -25,6 +25,7 @@ WRITERS = {
 NOT_OF_THE_GRAPH = {
     "ctx": "what torch keeps for the way back of a function",
     "bits": "a random generator's own",
+    "run": "how far a source of a batch is",
     "out": "the masks of the smoothing pass, while they are collected",
 }
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .concurrency import one_blas_thread
 from .config import Config, check_config, config_from_yaml, config_to_yaml
-from .errors import InputError
+from .errors import ConfigError, InputError
 from .evaluation.evaluate import evaluate_trajectory as score
 from .export.claim import CHECKPOINT, RECORDED, RECORDED_LIST, stopped_run
 from .export.run_folder import RunFolder
@@ -26,6 +26,7 @@ from .metric.spec import absolute
 from .offline.job import RunJob
 from .offline.reconstruction import Reconstruction
 from .offline.saved_map import SavedMap
+from .offline.segmented import TRACKED, Cut, Segments, cut, track_segments
 from .offline.tracked import MapMaterial
 from .parts import with_dataset_lens
 from .progress import Reporter, Silent
@@ -33,6 +34,7 @@ from .reading.files import is_file, resolved, user_path, whole_text
 from .reading.yaml_text import MOST_YAML_BYTES
 from .slam import Slam
 from .sources import open_source
+from .tracking.memory import can_remember
 from .types import Frame, Source
 
 Array = NDArray[Any]
@@ -74,6 +76,7 @@ def reconstruct(
     overwrite: bool = False,
     command: Sequence[str] = (),
     reporter: Reporter | None = None,
+    segments: Segments | None = None,
 ) -> Reconstruction:
     """Trajectory, masks, static cloud and splat of a video: everything, in memory and on disk.
 
@@ -82,30 +85,68 @@ def reconstruct(
     P(movable) maps. map: one that ``save_map`` wrote; the video goes on in its frame, lens and lengths, see
     ``Reconstruction.continues``. overwrite: an earlier run in ``out`` is removed at once, not when this one is
     complete; until then files are in ``out``/unfinished. command and reporter: what run.json and the terminal show.
+    segments: how a long video is tracked in pieces, several at once; in a map it stays whole.
     Raises SlamError children; what was computed until then is in the run folder, with run.log.
     """
     config, reporter = check_config(config or Config()), reporter or Silent()
     saved = load_map(map) if isinstance(map, str | Path) else map
     if not isinstance(source, str | Path):
         return _of_images(source, config, _Wanted(out, overwrite, command), saved, reporter)
+    if segments is not None:
+        segments.check(config, in_map=saved is not None)
+        segments = segments if saved is None else None
+    wanted = _Wanted(out, overwrite, command)
+    return Reconstruction(*_of_files(source, config, maps, wanted, reporter, segments, saved))
+
+
+@one_blas_thread()
+def track_piece(
+    source: str | Path,
+    out: str | Path,
+    config: Config,
+    *,
+    maps: str | Path | None = None,
+    command: Sequence[str] = (),
+    reporter: Reporter | None = None,
+) -> None:
+    """Track a segment of a video for ``reconstruct``: the checkpoint in ``out`` is all that comes of it.
+
+    Stopped, the same call goes on; done before, nothing is left to do. Raises as ``reconstruct``.
+    """
+    wanted = _Wanted(out, False, command)
+    _of_files(source, check_config(config), maps, wanted, reporter or Silent(), None, track_only=True)
+
+
+def _of_files(
+    source: str | Path,
+    config: Config,
+    maps: str | Path | None,
+    wanted: _Wanted,
+    reporter: Reporter,
+    segments: Segments | None,
+    saved: SavedMap | None = None,
+    *,
+    track_only: bool = False,
+) -> tuple[Path, tempfile.TemporaryDirectory[str] | None]:
+    """A run of a source that can be read again: its folder, and what keeps that where it is a temporary one."""
     read = {"path": _absolute(source), "maps": None if maps is None else _absolute(maps)}
     read["map"] = None if saved is None else _absolute(saved.path)
     slam, notes = _slam_of(source, config, maps, saved)
-    stopped = None if out is None or overwrite else _stopped_as(user_path(out, "out"), slam, read)
+    fresh = wanted.out is None or wanted.overwrite
+    stopped = None if fresh else _stopped_as(user_path(wanted.out or "", "out"), slam, read)
     if stopped is not None:
-        return _go_on(slam, stopped, reporter)
+        return _go_on(slam, stopped, reporter, segments, track_only=track_only), None
     inputs = [user_path(p) for p in (source, maps) if p is not None]
     inputs += [] if saved is None else [saved.path]
     inputs += [] if slam.scale is None else slam.scale.inputs
-    folder, temporary = _folder(_Wanted(out, overwrite, command), inputs)
+    folder, temporary = _folder(wanted, inputs)
     with folder:
         folder.update(source=read)
         job = slam.job(folder, reporter, checkpoints=temporary is None)
         folder.note(*notes)
         with job:
-            _track(slam, job)
-            slam.finish(job)
-    return Reconstruction(folder.path, temporary)
+            _track_all(slam, job, segments, track_only=track_only)
+    return folder.path, temporary
 
 
 @one_blas_thread()
@@ -127,7 +168,7 @@ def resume(run: str | Path, *, reporter: Reporter | None = None) -> Reconstructi
         raise InputError(f"{stopped}: expected config.yaml and source.path in run.json, got a run stopped before them")
     saved = load_map(read["map"]) if read.get("map") else None
     slam, _ = _slam_of(read["path"], config_from_yaml(stopped / "config.yaml"), read.get("maps"), saved)
-    return _go_on(slam, stopped, reporter or Silent())
+    return Reconstruction(_go_on(slam, stopped, reporter or Silent()))
 
 
 @one_blas_thread()
@@ -152,7 +193,7 @@ def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconst
     if not is_file(at / "config.yaml"):
         raise InputError(f"{at}: expected config.yaml beside the frames, got a run stopped before it")
     slam, _ = _slam_of(at / RECORDED, config_from_yaml(at / "config.yaml"), None)
-    return _go_on(slam, at, reporter or Silent())
+    return Reconstruction(_go_on(slam, at, reporter or Silent()))
 
 
 def _what_is_in(path: Path) -> str:
@@ -177,8 +218,10 @@ def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
     return stopped if same and all(was.get(k) == v for k, v in read.items()) else None
 
 
-def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
-    """A stopped run, from its last good checkpoint."""
+def _go_on(
+    slam: Slam, stopped: Path, reporter: Reporter, segments: Segments | None = None, *, track_only: bool = False
+) -> Path:
+    """A stopped run, from its last good checkpoint; its folder."""
     record = read_record(stopped)
     ended_live = bool(record.get("live")) and record.get("status") == "complete"
     with RunFolder.going_on(stopped, record) as folder:
@@ -198,11 +241,15 @@ def _go_on(slam: Slam, stopped: Path, reporter: Reporter) -> Reconstruction:
                 said = f"resumed from the checkpoint at {at}"
                 folder.note(said)
                 log.warning(said)
-                done = slam.go_on(memory, job)
-            if done is None:
-                _track(slam, job, job.frames)
-                slam.finish(job)
-    return Reconstruction(folder.path)
+                if not (track_only and memory.stage == "tracked"):  # then there is no more to do
+                    done = slam.go_on(memory, job)
+            if memory is None and segments is None and (before := record.get("segments")):
+                segments = Segments(before.get("frames"))
+            if memory is not None and track_only and memory.stage == "tracked":
+                folder.finish("incomplete", TRACKED)
+            elif done is None:
+                _track_all(slam, job, None if memory is not None else segments, track_only=track_only)
+    return folder.path
 
 
 def evaluate_trajectory(path: str | Path, kind: str, sequence: str | Path) -> dict[str, Any]:
@@ -260,6 +307,46 @@ def _folder(wanted: _Wanted, inputs: list[Path]) -> tuple[RunFolder, tempfile.Te
         out = temporary.name
     path = user_path(out, "out")
     return RunFolder(path, list(wanted.command), inputs, overwrite=wanted.overwrite), temporary
+
+
+def _track_all(slam: Slam, job: RunJob, segments: Segments | None, *, track_only: bool = False) -> None:
+    """All frames that were not tracked before, at once or in pieces, and what follows the last."""
+    pieces = None if segments is None else cut(slam.config, slam.source.length, segments)
+    if pieces is None or segments is None:
+        if segments is not None and segments.elsewhere is not None:
+            log.warning("the video stays whole, so there is nothing for other machines to do: see --segment-frames")
+        _track(slam, job, job.frames)
+    else:
+        _track_apart(slam, job, pieces, segments)
+    if not track_only:
+        slam.finish(job)
+        return
+    with job.timed("tracking"):
+        slam.end_tracking()
+    job.check_tracked()
+    job.keep("tracked", slam.memory)
+    job.folder.finish("incomplete", TRACKED)
+
+
+def _track_apart(slam: Slam, job: RunJob, pieces: Cut, segments: Segments) -> None:
+    """Pieces of the video by tasks of their own, joined here. run.json says which, and what became of them."""
+    if not can_remember(slam.masks):
+        raise ConfigError("segments: expected a filter of the mask that says what it remembers, got one that does not")
+    folder, read = job.folder, job.folder.record["source"]
+    folder.update(segments={"frames": pieces.frames, "windows": [[w.start, w.end] for w in pieces.windows]})
+    folder.note(pieces.said)
+    with job.timed("tracking"):
+        apart = track_segments(read, slam.config, pieces, segments, folder.path, job.reporter)
+        frames = [] if not apart.failed else [(f.index, f.timestamp_s) for f in slam.source.frames()]
+        joints = slam.take_segments(apart.segments, frames)
+    job.frames = len(slam.graph.records)
+    if job.processor_s is not None:
+        job.processor_s["tracking"] += apart.processor_s
+    lost = [f"segment of frames {w.start} to {w.end} failed: {why}; its frames are lost" for w, why in apart.failed]
+    for line in lost:
+        log.warning(line)
+    folder.note(*lost)
+    folder.update(segments={**folder.record["segments"], "joints": joints, "failed": lost})
 
 
 def _track(slam: Slam, job: RunJob, known: int = 0) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,6 +23,7 @@ from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
+from .graph.merging import with_lost_frames
 from .graph.passages import retake_passages
 from .metric.measure import measure
 from .offline.checkpoints import Checkpoints, Memory
@@ -37,12 +38,13 @@ from .sources.recorded import RecordedSource
 from .sources.rectified import RectifiedSource, rectified
 from .tracking.keyframes import Keyframes
 from .tracking.live_keyframes import LiveKeyframes
-from .tracking.loop_closure import add_covisible_pairs, close_loops
+from .tracking.loop_closure import COVISIBLE_PAIRS, add_covisible_pairs, close_loops
 from .tracking.lost_frames import find_lost
 from .tracking.masking import MaskTracker
 from .tracking.memory import TrackingMemory, can_remember, memory_of, remember
 from .tracking.observation import Near, Observer
 from .tracking.recovery import Recovery
+from .tracking.segments import PAIRS_AFTER_JOINING, join_segments
 from .tracking.state import Status, TrackingState
 from .tracking.two_view import TwoViewEstimator
 from .types import Frame, Source
@@ -124,6 +126,8 @@ class Slam:
         self.aligner = self.parts.aligner
         self.state = TrackingState()
         self._ended, self._tracked, self._tracking_s = False, 0, 0.0
+        self._given_up: set[int] = set()  # frames that are not looked for once more
+        self._pairs = COVISIBLE_PAIRS  # of keyframes matched after the last frame, for each of them
 
     def track(
         self,
@@ -205,6 +209,22 @@ class Slam:
         self.keyframes.close()
         return self._after_tracking(job, solved=memory.stage == "solved")
 
+    def take_segments(self, segments: list[TrackingMemory], frames: Collection[tuple[int, float]] = ()) -> list[Any]:
+        """What was tracked apart, in order of time, as if it had been tracked here; how the pieces were joined.
+
+        ``frames``: (index, seconds) of all; those that no piece has are lost, and not looked for once more.
+        Raises InputError where no piece has any depth.
+        """
+        needs_motion = self.parts.provider.depth_sigma_ratio is None
+        graphs = [s.graph for s in segments]
+        joints = join_segments(self.graph, graphs, self.keyframes.edges, needs_motion=needs_motion)
+        self._pairs = PAIRS_AFTER_JOINING
+        self.masks.remember(segments[-1].mask)  # what it has learned of the looks of things
+        known = {r.index for r in self.graph.records}
+        self._given_up = {index for index, _ in frames} - known
+        with_lost_frames(self.graph, frames)
+        return joints
+
     def end_tracking(self) -> None:
         """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched."""
         self._refuse_if_ended("finish")
@@ -216,8 +236,8 @@ class Slam:
             retake_passages(graph)
             if self.config.graph.loops:
                 close_loops(self.two_view, graph, self.parts.places)
-            add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs))
-        find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view)
+            add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
+        find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)
         self.masks.close()
         self.keyframes.close()
         getattr(self.parts.features, "forget", lambda: None)()  # nobody asks any more

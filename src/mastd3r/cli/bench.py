@@ -11,12 +11,14 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import InputError
+from .batch import check_ray_options, cluster_for, ray_options
 from .options import path
 from .screen import screen
 
 if TYPE_CHECKING:
     from ..experiments.store import Store
     from ..experiments.suite import Entry, SequenceSpec, Suite
+    from ..tasks.processes import Limits
 
 
 def bench_parser(p: argparse.ArgumentParser) -> None:
@@ -28,6 +30,7 @@ def bench_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--out", type=path, help="where results go and stay (default runs/bench-SUITE)")
     p.add_argument("--jobs", type=int, metavar="N", help="runs at once, each on its share of the cores (default 1)")
     p.add_argument("--memory-mib", type=float, metavar="M", help="for all of them (default: 80 %% of the machine's)")
+    ray_options(p)
     p.add_argument("--seeds", type=int, nargs="+", metavar="N", help="instead of the suite's")
     p.add_argument("--sequences", nargs="+", metavar="NAME", help="some of the suite's; for local, folders of --data")
     p.add_argument("--only", metavar="PATTERN", help="run entries whose sequence/variant/seed fits, such as 'jam/*/0'")
@@ -37,11 +40,12 @@ def bench_parser(p: argparse.ArgumentParser) -> None:
 
 
 def _bench(args: argparse.Namespace, console: Console) -> int:
-    from ..experiments.execute import limits
     from ..experiments.store import Store
     from ..experiments.suite import entries_of, load_suite, sequences_of
+    from ..tasks.processes import limits
 
     suite = load_suite(args.suite)
+    check_ray_options(args)
     allowed = limits(args.jobs, args.memory_mib)
     sequences = sequences_of(suite, args.data, args.sequences)
     chosen = entries_of(suite, sequences, args.seeds, args.only)
@@ -51,7 +55,7 @@ def _bench(args: argparse.Namespace, console: Console) -> int:
         return _show_list(chosen, folders, store)
     store.prepare()
     todo = [e for e in chosen if e.sequence.name in folders and _is_missing(store.get(e), args.retry)]
-    _run(todo, len(chosen), folders, store, allowed, console)
+    _run(todo, len(chosen), folders, store, allowed, args, console)
     written = _write(suite, sequences, folders, args, store)
     _say_what_is_missing(written, console)
     screen().print(f"wrote {store.out / 'table.md'} and {store.out / 'table.html'}", soft_wrap=True, markup=False)
@@ -77,12 +81,20 @@ def _show_list(chosen: list[Entry], folders: dict[str, Path], store: Store) -> i
 
 
 def _run(
-    todo: list[Entry], chosen: int, folders: dict[str, Path], store: Store, allowed: Any, console: Console
+    todo: list[Entry],
+    chosen: int,
+    folders: dict[str, Path],
+    store: Store,
+    allowed: Limits,
+    args: argparse.Namespace,
+    console: Console,
 ) -> None:
     from ..experiments.execute import run_entries
     from ..export.metric_names import summary_line
 
-    console.print(f"{len(todo)} of {chosen} entries to run, {allowed.jobs} at once within {allowed.memory_mib:.0f} MiB")
+    cluster = cluster_for(args, store.runs) if args.ray is not None and todo else None
+    where = f"{allowed.jobs} at once within {allowed.memory_mib:.0f} MiB" if cluster is None else cluster.said
+    console.print(f"{len(todo)} of {chosen} entries to run, {where}", highlight=False, markup=False, soft_wrap=True)
     count = 0
 
     def done(entry: Entry, record: dict[str, Any]) -> None:
@@ -92,7 +104,7 @@ def _run(
         line = f"{count}/{len(todo)} {entry.label} ({record['wall_s']:.0f} s): {said}"
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    run_entries(todo, folders, store, allowed, done=done)
+    run_entries(todo, folders, store, allowed, done=done, elsewhere=cluster)
 
 
 def _write(

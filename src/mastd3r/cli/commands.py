@@ -17,12 +17,14 @@ from rich.text import Text
 
 from ..config import Config, config_to_yaml, ranges
 from ..errors import ConfigError, InputError
+from .batch import segments_of
 from .options import checked_minutes, config_from_args
 from .screen import screen
 from .signals import end_this_command
 
 if TYPE_CHECKING:
     from ..offline.reconstruction import Reconstruction
+    from ..offline.segmented import Segments
     from ..progress import Reporter
 
 DEMO_SEED = 0
@@ -34,7 +36,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.end_with_stdin:
         threading.Thread(target=_interrupt_when_stdin_closes, daemon=True).start()
     config = config_from_args(args)
-    return _run_and_show(args.source, config, args, console)
+    if args.segment:
+        from ..pipeline import track_piece
+
+        track_piece(args.source, args.out, config, maps=args.maps, command=args.words)
+        return 0
+    return _run_and_show(args.source, config, args, console, segments_of(args))
 
 
 def scale(args: argparse.Namespace, console: Console) -> int:
@@ -82,7 +89,13 @@ def _interrupt_when_stdin_closes() -> None:
     end_this_command()
 
 
-def _run_and_show(source: Path, config: Config, args: argparse.Namespace, console: Console) -> int:
+def _run_and_show(
+    source: Path,
+    config: Config,
+    args: argparse.Namespace,
+    console: Console,
+    segments: Segments | None = None,
+) -> int:
     """``args`` are those of ``run``, or of ``demo``, which has fewer."""
     from ..pipeline import reconstruct
 
@@ -95,6 +108,7 @@ def _run_and_show(source: Path, config: Config, args: argparse.Namespace, consol
         overwrite=args.overwrite,
         command=args.words,
         reporter=reporter_of(args, console),
+        segments=segments,
     )
     show(result)
     return 0

@@ -15,6 +15,7 @@ EXIT_FAULT, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 KEPT = "what was computed so far is in the run folder"
 KEPT_BY = dict.fromkeys(("download", "weights"), "what has arrived is kept, the same command goes on from there")
 KEPT_BY |= dict.fromkeys(("export", "save", "localise"), "nothing half-written stays")
+KEPT_BY["batch"] = "runs that are complete stay, the same command goes on with the others"
 KEPT_BY["view"] = "the run is as it was"
 
 

@@ -16,6 +16,7 @@ from ..metric.spec import FORMS
 from ..reading.files import short
 from ..registry import ALIGNMENT, POINTMAPS, SEMANTICS, Registry
 from . import commands
+from .batch import batch_parser, segment_options
 from .bench import bench_parser
 from .compile import PARTS, compile_kernels
 from .download import download_parser
@@ -80,6 +81,8 @@ def parser() -> argparse.ArgumentParser:
     top.add_argument("-v", "--verbose", action="store_true", help="say more")
     known = top.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _run_parser(known.add_parser("run", help="a video, image folder or TUM-layout folder to a run folder"))
+    many = known.add_parser("batch", help="a run of each of many videos, some at once")
+    batch_parser(many, _run_options(many))
     again = known.add_parser("resume", help="go on with a run that was stopped, from its last checkpoint")
     again.add_argument("run", type=path, help="run folder; source and options are those that it was started with")
     again.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
@@ -151,14 +154,24 @@ def _eval_parser(p: argparse.ArgumentParser) -> None:
 def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("source", type=path, help="video, folder of images, or sequence of a dataset (mastd3r download)")
     p.add_argument("--out", type=path, required=True, help="run folder")
+    p.add_argument("--map", type=path, help="go on in a map of mastd3r save: its frame, its lens, its lengths")
+    p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
+    _run_options(p)
+    segment_options(p)
+    p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs that are tasks
+    p.add_argument("--segment", action="store_true", help=argparse.SUPPRESS)  # one of those that --segment-frames makes
+    p.set_defaults(act=commands.run)
+
+
+def _run_options(p: argparse.ArgumentParser) -> list[argparse.Action]:
+    """The options of a run that mean the same for any source."""
+    before = len(p._actions)
     p.add_argument("--overwrite", action="store_true", help=OVERWRITE_HELP)
     p.add_argument("--config", type=path, help="YAML file with options that differ from the defaults")
     p.add_argument("--preset", choices=tuple(PRESETS), help=PRESET_HELP)
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE", help="any option of config.yaml")
     p.add_argument("--pointmaps", choices=POINTMAPS.choices, help=_listed(POINTMAPS))
     p.add_argument("--semantics", choices=SEMANTICS.choices, help=_listed(SEMANTICS))
-    p.add_argument("--map", type=path, help="go on in a map of mastd3r save: its frame, its lens, its lengths")
-    p.add_argument("--maps", type=path, help="folder of P(movable) maps, named like the frames or by timestamp")
     p.add_argument("--correction", choices=ALIGNMENT.choices, help=_listed(ALIGNMENT))
     p.add_argument("--map-loss", choices=get_args(MapLossKind), help="which pixels the map learns from (Table V)")
     p.add_argument("--quality", choices=get_args(MapQualityKind), help=QUALITY_HELP)
@@ -176,8 +189,7 @@ def _run_parser(p: argparse.ArgumentParser) -> None:
     p.add_argument("--stride", type=int, help="every n-th frame")
     p.add_argument("--seed", type=int, help="of everything that is drawn at random (default 0)")
     p.add_argument("--quiet", action="store_true", help="no progress bars, no warnings")
-    p.add_argument("--end-with-stdin", action="store_true", help=argparse.SUPPRESS)  # for runs of a bench
-    p.set_defaults(act=commands.run)
+    return p._actions[before:]
 
 
 def _listed(registry: Registry) -> str:

@@ -4,24 +4,26 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from ..config import config_to_yaml
-from ..errors import InputError, OutputError
+from ..errors import InputError
+from ..export.claim import claim_shelf
 from ..export.files import write_json, writing
 from ..export.machine import machine_info
 from ..export.read_run import read_json
 from ..reading.files import whole_json
 from ..registry import LARGEST
+from ..tasks.lock import alone_in
+from ..tasks.process import Ended
 from .suite import Entry, SequenceSpec, Suite
 
 PATH_POINTS = 150  # of a path that is kept for the plots
-LOCK_WAIT_S = 15.0  # entries of a bench that was killed end by themselves within seconds
 
 
 class Store:
@@ -32,37 +34,14 @@ class Store:
 
     def prepare(self) -> None:
         """Make the folders. Raises OutputError for a folder with other files in it."""
+        claim_shelf(self.out, self.entries.name, "an earlier bench")
         with writing(self.out):
-            self.out.mkdir(parents=True, exist_ok=True)
-            if any(self.out.iterdir()) and not self.entries.is_dir():
-                raise OutputError(f"{self.out}: expected an empty folder or an earlier bench, got one with other files")
             self.entries.mkdir(exist_ok=True)
             self.runs.mkdir(exist_ok=True)
 
-    @contextmanager
-    def locked(self) -> Iterator[int | None]:
-        """Hold the folder against a second bench; gives the lock's file, which entries inherit and so hold too.
-
-        None on a system without such locks. Raises OutputError where another bench keeps it.
-        """
-        try:
-            import fcntl
-        except ImportError:  # not a POSIX system: no such lock
-            yield None
-            return
-        with writing(self.out):
-            (self.out / ".lock").touch()
-        with open(self.out / ".lock") as file:
-            end = time.monotonic() + LOCK_WAIT_S
-            while True:
-                try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    break
-                except OSError as e:
-                    if time.monotonic() > end:
-                        raise OutputError(f"{self.out}: expected no other bench at work in it, got one") from e
-                    time.sleep(0.2)
-            yield file.fileno()
+    def locked(self) -> AbstractContextManager[int | None]:
+        """Hold the folder against a second bench, see ``alone_in``. Raises OutputError."""
+        return alone_in(self.out, "bench")
 
     def get(self, entry: Entry) -> dict[str, Any] | None:
         """What is recorded of an entry, or None: it has not run, or its file is not one of ours."""
@@ -121,19 +100,19 @@ def command_of(entry: Entry, folder: str, out: str) -> list[str]:
     return ["mastd3r", "run", folder, "--out", out, *sets]
 
 
-def record_of(entry: Entry, run: Path, *, exit_code: int, said: str, wall_s: float, jobs: int) -> dict[str, Any]:
+def record_of(entry: Entry, run: Path, ended: Ended, *, jobs: int) -> dict[str, Any]:
     """One entry's JSON from its run folder: the figures, or the one line that says why there are none."""
     told = _read(run / "run.json")
     found = _read(run / "metrics.json")
-    complete = exit_code == 0 and told.get("status") == "complete" and bool(found)
+    complete = ended.exit_code == 0 and told.get("status") == "complete" and bool(found)
     machine = told.get("machine") or machine_info()
     record: dict[str, Any] = {
         "status": "complete" if complete else "failed",
-        "error": None if complete else _why(exit_code, said, told),
-        "exit_code": exit_code,
+        "error": None if complete else _why(ended, told),
+        "exit_code": ended.exit_code,
         "command": shlex.join(command_of(entry, entry.sequence.folder or entry.sequence.name, "RUN")),
         "metrics": found if complete else {},
-        "wall_s": round(wall_s, 1),
+        "wall_s": round(ended.wall_s, 1),
         "jobs": jobs,
         "date": time.strftime("%Y-%m-%d"),
         "machine": {**machine, "accelerator": told.get("accelerator")},
@@ -232,9 +211,6 @@ def _read(path: Path) -> dict[str, Any]:
         return {}  # the run ended while it wrote: the record says that it failed
 
 
-def _why(exit_code: int, said: str, told: dict[str, Any]) -> str:
-    if exit_code < 0:
-        return f"ended by signal {-exit_code}" + (", perhaps for want of memory" if exit_code == -9 else "")
-    lines = said.strip().splitlines()
-    last = lines[-1].removeprefix("mastd3r: ") if lines else told.get("reason")
-    return str(last or f"exit code {exit_code} and no message")
+def _why(ended: Ended, told: dict[str, Any]) -> str:
+    own = told.get("reason")
+    return str(own) if own and not ended.killed and not ended.said.strip() else ended.reason

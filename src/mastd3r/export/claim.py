@@ -26,9 +26,12 @@ FOLDERS = ("masks", "renders", "alpha", "depth")
 RECORDED, RECORDED_LIST = "recorded", "rgb.txt"  # frames of a live run, which nobody can take again
 RECORD_FILE, RESERVE = "run.json", ".reserve"
 CHECKPOINT = "checkpoint"  # folder of a run that goes on, or was stopped
+LOCK = ".lock"  # of a folder that many runs are written in, while a command is at work there
+SEGMENTS = "segments"  # folder of a run whose pieces are tracked apart: PLAN/NUMBER, a run folder each
 UNFINISHED = "unfinished"  # where a run is written while an earlier one stands
 MOVING = ".moving"  # in it: what the earlier one had more of is gone
 PICTURE = re.compile(r"-?\d+\.\d{6}\.png(\.part)?")  # as a run names them; others in its folders are not ours
+SEGMENT_FILE = re.compile(r"config\.yaml|\.shared|\.lock|\d+\.(log|node)")  # beside the pieces
 RECORD = {"status": str, "command": list, "machine": dict, "choices": list, "timings_s": dict}  # of our run.json
 ANOTHER = "choose another folder with --out"
 
@@ -60,6 +63,8 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
         settle(folder)
         if not overwrite:
             _refuse_recorded(folder)
+        if overwrite:
+            remove_segments(folder)
         _remove_run(unfinished)
         if (folder / "trajectory.txt").is_file() and not overwrite:
             folder = unfinished
@@ -67,6 +72,19 @@ def claim(folder: Path, inputs: Sequence[Path] = (), *, overwrite: bool = False)
         for name in FOLDERS:
             (folder / name).mkdir(parents=True, exist_ok=True)
         return folder
+
+
+def claim_shelf(folder: Path, mark: str, said: str, inputs: Sequence[Path] = ()) -> None:
+    """Make a folder ready that holds many runs, each in a folder of its own: an empty one, or one with ``mark`` in it.
+
+    ``said``: what ``mark`` is a sign of. Raises OutputError for a folder with other files, one that holds an input
+    or lies in one, and whatever the system refuses.
+    """
+    with writing(folder):
+        refuse_inputs(folder, inputs)
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(p.name != LOCK for p in folder.iterdir()) and not (folder / mark).exists():
+            raise OutputError(f"{folder}: expected an empty folder or {said}, got one with other files; {ANOTHER}")
 
 
 def settle(folder: Path, *, also_incomplete: bool = False) -> None:
@@ -110,6 +128,20 @@ def _remove_run(folder: Path) -> None:
     for path in (*(folder / name for name in (*FOLDERS, RECORDED)), folder):
         with suppress(OSError):
             path.rmdir()
+
+
+def remove_segments(folder: Path) -> None:
+    """Remove the pieces of a run that were tracked apart: nothing of them is needed any more. Raises OSError."""
+    for plan in (folder / SEGMENTS).glob("*"):
+        for path in sorted(plan.glob("*")):
+            if path.is_dir() and path.name.isdigit():
+                _remove_run(path)
+            elif SEGMENT_FILE.fullmatch(path.name):
+                path.unlink()
+        with suppress(OSError):
+            plan.rmdir()
+    with suppress(OSError):
+        (folder / SEGMENTS).rmdir()
 
 
 def _pictures(folder: Path) -> list[Path]:
@@ -161,7 +193,7 @@ def _refuse_recorded(folder: Path) -> None:
 
 
 def _refuse_links(folder: Path) -> None:
-    for name in (*FILES, *FOLDERS, RECORDED, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT):
+    for name in (*FILES, *FOLDERS, RECORDED, RECORD_FILE, RESERVE, UNFINISHED, CHECKPOINT, SEGMENTS):
         if (folder / name).is_symlink():
             raise OutputError(f"{folder / name}: expected a file or folder of a run, got a symbolic link; {ANOTHER}")
 

@@ -19,7 +19,7 @@ from ..camera.pinhole import Camera
 from ..concurrency import undivided
 from ..errors import OutputError, SlamError, reason_of
 from ..types import StaticCloud, Trajectory
-from .claim import FOLDERS, RESERVE, UNFINISHED, check_not_in_use, check_ours, claim, settle
+from .claim import FOLDERS, RESERVE, UNFINISHED, check_not_in_use, check_ours, claim, remove_segments, settle
 from .files import write_bytes, write_json, write_text, writing
 from .machine import machine_info
 from .point_cloud import write_cloud
@@ -130,6 +130,9 @@ class RunFolder:
         if status not in {"complete", "incomplete"} or (status == "incomplete") != bool(reason):
             raise ValueError(f"expected complete, or incomplete with a reason; got {status!r}, {reason!r}")
         self.make_room()
+        if status == "complete":
+            with writing(self.path):
+                remove_segments(self.path)
         self.update(**self.ending(status, reason))
         if status == "complete" and self.path != self.home:
             self.log.close()

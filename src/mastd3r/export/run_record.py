@@ -95,6 +95,8 @@ RECORD: dict[str, tuple[Fits, str]] = {
     "scale.said": (text, "text"),
     "scale.refused": (text, "text"),
     "graph": (mapping(), "an object"),
+    "segments": (mapping(), "an object"),
+    "segments.frames": (lambda v: type(v) is int and v > 0, "a number of frames"),
     "live": (mapping(), "an object"),
     "live.recorded": (lambda v: isinstance(v, bool), "true or false"),
     "live.figures": (mapping(number), "numbers by name"),

@@ -53,8 +53,13 @@ def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> None:
     if graph.held and keep == 0:
         graph.found_in_map(graph.records[-1].index)
     cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (i, j))
+    bring(graph, gone, keep, cam_i.inverse() @ j_from_i.inverse() @ cam_j)
+
+
+def bring(graph: KeyframeGraph, gone: int, keep: int, keep_from_gone: Sim3) -> None:
+    """Bring a submap into the world of another one; they are one from here on."""
     moved = graph.members(gone)
-    graph.transform_keyframes(moved, cam_i.inverse() @ j_from_i.inverse() @ cam_j)
+    graph.transform_keyframes(moved, keep_from_gone)
     for k in moved:
         graph.submap_of[k] = keep
     graph.started.discard(gone)

@@ -248,11 +248,13 @@ def _drift(seen: _Seen) -> str:
     return f"{np.degrees(seen.drift):.0f} deg and {seen.gap_ratio:.0%} of the way of drift"
 
 
-def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int]) -> int:
+def add_covisible_pairs(
+    graph: KeyframeGraph, connect: Callable[[list[tuple[int, int]]], int], most: int = COVISIBLE_PAIRS
+) -> int:
     """Match all pairs of keyframes that should see the same by their poses and were not matched before; how many.
 
     While tracking a keyframe is matched with its neighbours only. What sees the same from far apart in time holds
-    the chain together across them. At most ``COVISIBLE_PAIRS`` a keyframe, those that share most first.
+    the chain together across them. At most ``most`` a keyframe, those that share most first.
     """
     ids = graph.members()
     done = graph.connected_pairs()
@@ -265,8 +267,7 @@ def add_covisible_pairs(graph: KeyframeGraph, connect: Callable[[list[tuple[int,
             share, motion = min(shared[i][j][0], shared[j][i][0]), max(shared[i][j][1], shared[j][i][1])
             if share >= COVISIBLE_OVERLAP and motion <= COVISIBLE_MOTION:
                 pairs.append((-share, j, i))
-    most = COVISIBLE_PAIRS * len(graph.free_members())
-    made = connect([(i, j) for _, i, j in sorted(pairs)[:most]])
+    made = connect([(i, j) for _, i, j in sorted(pairs)[: most * len(graph.free_members())]])
     log.info("%d of %d pairs that may see the same were matched", made, len(pairs))
     return made
 

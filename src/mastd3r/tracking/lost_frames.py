@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -20,12 +20,20 @@ ALIKE = 2  # and of those that share most features with it
 MIN_MATCHES, MIN_INLIERS = 60, 0.5  # a frame that cannot be shown to be right stays lost: it is interpolated
 
 
-def find_lost(frames: Iterator[Frame], graph: KeyframeGraph, observer: Observer, two_view: TwoViewEstimator) -> int:
+def find_lost(
+    frames: Iterator[Frame],
+    graph: KeyframeGraph,
+    observer: Observer,
+    two_view: TwoViewEstimator,
+    but: Collection[int] = (),
+) -> int:
     """Place the lost frames that keyframes of a map see; ``frames`` are those of the source. How many were found.
+
+    ``but``: indices of frames that are not looked for.
 
     While tracking a frame could be sought in what came before it alone.
     """
-    lost = {r.index: r for r in graph.records if r.state == "lost"}
+    lost = {r.index: r for r in graph.records if r.state == "lost" and r.index not in but}
     known = [kf for kf in graph.keyframes if graph.submap_of[kf.id] in graph.started]
     if not lost or not known:
         return 0
