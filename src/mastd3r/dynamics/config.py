@@ -102,12 +102,13 @@ class RefinementConfig:
     """Edge-aware refinement: log-odds as whole objects at full size."""
 
     enabled: bool = True  # False: the half-size log-odds are only enlarged
+    saturation: Positive = 4.0  # log-odds from which evidence is hardly surer when it is pooled, where there is no map
     region_px: Positive = 20.0  # reach of the pooling where there is no edge
     region_contrast: Positive = 15.0  # grey levels that are as far as region_px
     semantic_contrast: NotNegative = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
     chroma_gain: NotNegative = 1.5  # a step of colour against one of grey
     edge_px: Annotated[int, Range(1, 512)] = (
-        8  # radius of the guided filter that brings masks to the full image's edges
+        8  # radius of the guided filter that brings masks to the full image's edges, at 512 x 384 working pixels
     )
     edge_contrast: Positive = 20.0  # grey levels that it takes for an edge
     fine_px: Positive = 24.0  # full-size pixels, reach of the last step, where there is colour
