@@ -37,13 +37,18 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TrainingRates:
-    """Adam steps; the means' is a share of the median depth of the seeds and falls to a hundredth."""
+    """Adam steps; the means' is a share of the median depth of the seeds. Steps fall evenly in their logarithm.
 
-    means: float = 3.2e-4
+    A training has a tenth of the steps of the field's usual ones, so they are larger: what a Gaussian can move and
+    change its shape by is their sum.
+    """
+
+    means: float = 2e-3
     means_last_ratio: float = 0.01
-    log_scales: float = 5e-3
-    quats: float = 1e-3
+    log_scales: float = 2e-2
+    quats: float = 4e-3
     opacity_logits: float = 5e-2
+    shape_last_ratio: float = 0.3  # of the last three
     colors: float = 2.5e-3
     sh_rest: float = 1e-3
 
@@ -150,7 +155,7 @@ class Mapper:
     def settle(self) -> None:
         """Make the map what its file shows: colours at the mean exposure, nothing right before a camera."""
         if self.config.exposure:
-            gain, bias = self._view_parameters.centre_exposure()
+            gain, bias = self._view_parameters.centre_exposure(self._pace.exposure_share)
             self._map = self._map.exposed(gain, bias)
         self._clear_and_limit(len(self._views))
 
@@ -267,7 +272,8 @@ class Mapper:
         cam_from_world = self._view_parameters.cam_from_world(number)
         background = torch.rand(3, generator=self._backgrounds).to(self._device)
         color, _, alpha = self._draw(cam_from_world, K, camera.width, camera.height, stats)
-        color = self._view_parameters.exposed(color, alpha, number) + (1 - alpha)[..., None] * background
+        color = self._view_parameters.exposed(color, alpha, number, self._pace.exposure_share)
+        color = color + (1 - alpha)[..., None] * background
         loss = self._loss(color, number, shrink) + self._view_parameters.prior(number).to(color.device)
         loss.backward()
         self._policy.observe(self._map, stats, camera.width)
@@ -287,14 +293,15 @@ class Mapper:
         return photometric_loss(color, target, weight, self.config.ssim_share)
 
     def _current_rates(self) -> dict[str, float]:
-        r = self._rates
+        r, done = self._rates, self._pace.done
+        shape = r.shape_last_ratio**done
         return {
-            "means": r.means * self._depth * r.means_last_ratio**self._pace.done,
-            "log_scales": r.log_scales,
-            "quats": r.quats,
-            "opacity_logits": r.opacity_logits,
+            "means": r.means * self._depth * r.means_last_ratio**done,
+            "log_scales": r.log_scales * shape,
+            "quats": r.quats * shape,
+            "opacity_logits": r.opacity_logits * shape,
             "colors": r.colors,
-            "sh_rest": r.sh_rest if self._pace.done >= SH_FROM else 0.0,
+            "sh_rest": r.sh_rest if done >= SH_FROM else 0.0,
         }
 
 
