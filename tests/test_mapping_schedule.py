@@ -77,3 +77,8 @@ def test_what_views_sample_and_what_stands_in_their_way() -> None:
     assert seen.pixel[:3] == pytest.approx([2 / 50, 0.1 / 50, 0])
     assert seen.blocks.tolist() == [False, True, False, False]
     assert seen.distance == pytest.approx([2, 0.1, 4, 13**0.5])
+
+
+def test_exposures_go_into_the_colours_before_the_end() -> None:
+    shares = [Pace(320, 100, done).exposure_share for done in (0, 75, 80, 90, 100)]
+    assert shares[:2] == [1, 1] and 0 < shares[2] < 1 and shares[3:] == pytest.approx([0, 0], abs=1e-12)

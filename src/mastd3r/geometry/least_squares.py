@@ -19,6 +19,8 @@ NOISE = 1e-9  # relative rise of the cost that is rounding
 def damped_solve(hess: Any, rhs: Array, damping: float) -> Array | None:
     """Solve (H + damping diag H) x = b for symmetric H (n, n), dense or sparse; None where not positive definite.
 
+    b is (n,), or (n, m) for m of them at once.
+
     Unknowns with an empty row (no observation, or fixed) get a zero step.
     """
     if issparse(hess):
@@ -42,7 +44,7 @@ def _sparse_step(hess: Any, rhs: Array, damping: float) -> Array | None:
         factor = splu(system.tocsc(), "MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
     except RuntimeError:  # exactly singular
         return None
-    step = np.where(used, factor.solve(rhs), 0.0)
+    step = np.where(used.reshape(-1, *(1,) * (rhs.ndim - 1)), factor.solve(rhs), 0.0)
     return step if (factor.U.diagonal() > 0).all() and np.isfinite(step).all() else None
 
 

@@ -37,6 +37,7 @@ class SolveReport:
     cost_first: float
     cost_last: float
     focal_sigma_ratio: float  # 1-sigma of log f under unit pixel noise, inf where f is fixed
+    lens_covariance: Array | None = None  # (6, 6) of the lens under unit pixel noise, 0 for what is fixed
 
 
 def solve(
@@ -71,8 +72,10 @@ def solve(
     for i, term in problem.terms.items():
         variables[i].depth_info = term.depth_info
     intrinsics.values = end.g
-    sigma = float("inf") if found.hess is None else _focal_sigma(found.hess, intrinsics)
-    return SolveReport(found.iterations, found.converged, found.cost_first, found.cost_last, sigma)
+    lens = None if found.hess is None else _lens_covariance(found.hess)
+    known = lens is not None and intrinsics.free[0] and lens[0, 0] > 0
+    sigma = float(np.sqrt(lens[0, 0])) if lens is not None and known else float("inf")
+    return SolveReport(found.iterations, found.converged, found.cost_first, found.cost_last, sigma, lens)
 
 
 @dataclass
@@ -262,10 +265,8 @@ def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array,
     return hess, rhs, anchor_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 
-def _focal_sigma(hess: Any, intrinsics: Intrinsics) -> float:
-    if not intrinsics.free[0]:
-        return float("inf")
-    unit = np.zeros(hess.shape[0])
-    unit[-N_GLOBAL] = 1.0
-    column = damped_solve(hess, unit, 1e-9)
-    return float("inf") if column is None or column[-N_GLOBAL] <= 0 else float(np.sqrt(column[-N_GLOBAL]))
+def _lens_covariance(hess: Any) -> Array | None:
+    units = np.zeros((hess.shape[0], N_GLOBAL))
+    units[-N_GLOBAL:] = np.eye(N_GLOBAL)
+    columns = damped_solve(hess, units, 1e-9)
+    return None if columns is None else columns[-N_GLOBAL:]

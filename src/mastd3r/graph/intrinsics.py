@@ -44,6 +44,13 @@ def as_given(intrinsics: Intrinsics) -> Intrinsics:
     return Intrinsics(intrinsics.values, intrinsics.values, np.full(N_GLOBAL, np.inf))
 
 
+def without_radial(intrinsics: Intrinsics) -> Intrinsics:
+    """The same with no radial term, held there."""
+    values, info = intrinsics.values.copy(), intrinsics.prior_info.copy()
+    values[list(RADIAL)], info[list(RADIAL)] = 0.0, np.inf
+    return Intrinsics(values, intrinsics.prior, info, intrinsics.focal_source)
+
+
 def of_camera(camera: Camera) -> Intrinsics:
     """Those of a camera at working size, as given; fx and fy are joined by their geometric mean."""
     focal = float(np.sqrt(camera.fx_px * camera.fy_px))

@@ -19,7 +19,7 @@ from ..geometry.sim3 import Sim3
 from ..types import StaticCloud, View
 from .adam import RowAdam
 from .correction import Visibility, changes_of, deformation, fitted_pose, followed, visibility
-from .coverage import gaps_filled
+from .coverage import gaps_filled, with_backdrop
 from .densify import DensifyPolicy, DensifySettings
 from .gaussians import Array, GaussianArrays, GaussianMap
 from .losses import mask_loss, photometric_loss, squared_color_error
@@ -37,18 +37,24 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class TrainingRates:
-    """Adam steps; the means' is a share of the median depth of the seeds and falls to a hundredth."""
+    """Adam steps; the means' is a share of the median depth of the seeds. Steps fall evenly in their logarithm.
 
-    means: float = 3.2e-4
+    A training has a tenth of the steps of the field's usual ones, so they are larger: what a Gaussian can move and
+    change its shape by is their sum.
+    """
+
+    means: float = 2e-3
     means_last_ratio: float = 0.01
-    log_scales: float = 5e-3
-    quats: float = 1e-3
+    log_scales: float = 2e-2
+    quats: float = 4e-3
     opacity_logits: float = 5e-2
+    shape_last_ratio: float = 0.3  # of the last three
     colors: float = 2.5e-3
     sh_rest: float = 1e-3
 
 
 SEED_SHARE = 0.3  # of max_gaussians, so that densification has room
+BACKDROP_SHARE = 0.03  # of max_gaussians, kept for what stands behind holes at the end
 DEFORMATION_RATIO = 2e-3  # of the median depth, about half a pixel: below, Gaussians move by their anchor
 SH_FROM = 0.4  # of the training; before that, colours do not depend on the direction
 LEAST_SIGMA_PX = 0.2  # standard deviation of the smallest Gaussian, in pixels of the view that sees it largest
@@ -90,7 +96,9 @@ class Mapper:
             self._map = seed_gaussians(cloud, self._seeds, seed, device, config.sh_degree or 0)
         self._map.backend = config.backend
         self._adam = RowAdam(self._map.parameters())
-        self._policy = DensifyPolicy(config.max_gaussians, seed, densify or DensifySettings())
+        self._policy = DensifyPolicy(
+            int(config.max_gaussians * (1 - BACKDROP_SHARE)), seed, densify or DensifySettings()
+        )
         self._depth, self._near = _depths(self._map, self._views)
         self._view_parameters = ViewParameters(self._views, config.refine_poses, self._depth, config.exposure)
         self._targets = Targets(config, device)
@@ -148,11 +156,12 @@ class Mapper:
             return np.linalg.inv(self._view_parameters.corrected_at(cam_from_world, timestamp_s).numpy())
 
     def settle(self) -> None:
-        """Make the map what its file shows: colours at the mean exposure, nothing right before a camera."""
+        """Make the map what its file shows: colours at the mean exposure, nothing right before a camera, no hole."""
         if self.config.exposure:
-            gain, bias = self._view_parameters.centre_exposure()
+            gain, bias = self._view_parameters.centre_exposure(self._pace.exposure_share)
             self._map = self._map.exposed(gain, bias)
         self._clear_and_limit(len(self._views))
+        self._fill_holes()
 
     def extend(self, views: list[View], cloud: StaticCloud) -> None:
         """More views (up to ``max_views``), and seeds from more points, up to half of what the limit leaves free.
@@ -217,6 +226,14 @@ class Mapper:
             found = fitted_pose(transform(pose, old), transform(tracked, new), weight, self._depth)
             self._view_parameters.correct(number, *found)
 
+    def _fill_holes(self) -> None:
+        """A backdrop behind what no photograph shows."""
+        numbers, count = _evenly(range(len(self._views)), MAX_VISIBILITIES), len(self._map)
+        poses = [self._view_parameters.cam_from_world(n).detach().numpy() for n in numbers]
+        room, near = self.config.max_gaussians - count, NEAR_RATIO * self._depth
+        self._map = with_backdrop(self._map, [self._views[n] for n in numbers], poses, near, room)
+        self._adam.grow(len(self._map) - count)
+
     def _fill_gaps(self) -> None:
         """Seeds where the cloud has left the photographs' static pixels open."""
         numbers = _evenly(range(len(self._views)), MAX_VISIBILITIES)
@@ -267,7 +284,8 @@ class Mapper:
         cam_from_world = self._view_parameters.cam_from_world(number)
         background = torch.rand(3, generator=self._backgrounds).to(self._device)
         color, _, alpha = self._draw(cam_from_world, K, camera.width, camera.height, stats)
-        color = self._view_parameters.exposed(color, alpha, number) + (1 - alpha)[..., None] * background
+        color = self._view_parameters.exposed(color, alpha, number, self._pace.exposure_share)
+        color = color + (1 - alpha)[..., None] * background
         loss = self._loss(color, number, shrink) + self._view_parameters.prior(number).to(color.device)
         loss.backward()
         self._policy.observe(self._map, stats, camera.width)
@@ -287,14 +305,15 @@ class Mapper:
         return photometric_loss(color, target, weight, self.config.ssim_share)
 
     def _current_rates(self) -> dict[str, float]:
-        r = self._rates
+        r, done = self._rates, self._pace.done
+        shape = r.shape_last_ratio**done
         return {
-            "means": r.means * self._depth * r.means_last_ratio**self._pace.done,
-            "log_scales": r.log_scales,
-            "quats": r.quats,
-            "opacity_logits": r.opacity_logits,
+            "means": r.means * self._depth * r.means_last_ratio**done,
+            "log_scales": r.log_scales * shape,
+            "quats": r.quats * shape,
+            "opacity_logits": r.opacity_logits * shape,
             "colors": r.colors,
-            "sh_rest": r.sh_rest if self._pace.done >= SH_FROM else 0.0,
+            "sh_rest": r.sh_rest if done >= SH_FROM else 0.0,
         }
 
 

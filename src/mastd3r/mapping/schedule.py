@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 SMALLEST_PX = 150  # width below which images are not made smaller
 SHRINKS = (4, 2, 1)
+EXPOSURE_FADES = (0.75, 0.9)  # share of the training from which, and at which, exposures go into the colours
 STEP_SHARES = (0.2, 0.3, 0.5)  # of the steps; a level that is left out gives its share to the next larger one
 TIME_SHARES = (0.07, 0.18, 0.75)  # of the time, where that is what is given
 
@@ -48,6 +49,16 @@ class Pace:
             passed = (time.monotonic() - self._began) / max(self._seconds, 1e-9)
             return min(1.0, self._from + (1 - self._from) * passed)
         return min(1.0, self.steps / max(1, self._all))
+
+    @property
+    def exposure_share(self) -> float:
+        """How much of its own exposure a view is drawn with, 1 to 0.
+
+        A file has one colour for all who look at it. Exposures of their own keep the views from contradicting one
+        another while the world takes shape; at the end every place takes the colours of those who see it.
+        """
+        first, last = EXPOSURE_FADES
+        return min(1.0, max(0.0, (last - self.done) / (last - first)))
 
     @property
     def shrink(self) -> int:

@@ -12,9 +12,10 @@ from .gaussians import Array
 
 _EXPOSURE_RATE = 2e-3
 _EXPOSURE_PRIOR = 0.3  # holds every exposure near neutral: what few views see could as well be darker, all of it
-_POSE_RATE = 1e-3  # radians, and map units per unit of median depth
+_POSE_RATE = 2e-3  # radians, and map units per unit of median depth
 _POSE_RATE_LAST_RATIO = 0.1
-_NAMES = ("log_gain", "bias", "shift", "turn")
+_EXPOSURE = ("log_gain", "bias")
+_NAMES = (*_EXPOSURE, "shift", "turn")
 
 
 class ViewParameters:
@@ -59,21 +60,30 @@ class ViewParameters:
         for name, value in (("shift", shift), ("turn", turn)):
             self._rows[number][name].data.copy_(torch.from_numpy(np.asarray(value, np.float32)))
 
-    def exposed(self, color: torch.Tensor, alpha: torch.Tensor, number: int) -> torch.Tensor:
-        """Colour (h, w, 3) over black as that view's exposure shows it: gain * colour + bias * alpha."""
-        if not self._exposure:
+    def exposed(self, color: torch.Tensor, alpha: torch.Tensor, number: int, share: float = 1.0) -> torch.Tensor:
+        """Colour (h, w, 3) over black as that view's exposure shows it: gain * colour + bias * alpha.
+
+        ``share`` of it alone, 0..1: the rest is left to the colours of the map, which no file can tell apart by view.
+        """
+        if not self._exposure or share <= 0:
             return color
         row = self._rows[number]
-        gain, bias = row["log_gain"].exp().to(color.device), row["bias"].to(color.device)
-        return color * gain + alpha[..., None] * bias
+        log_gain, bias = (share * row[name].to(color.device) for name in _EXPOSURE)
+        return color * log_gain.exp() + alpha[..., None] * bias
 
-    def centre_exposure(self) -> tuple[Array, Array]:
-        """Make the mean exposure of all views the neutral one: gain and bias (3,) that the map's colours must take."""
-        mean = {name: torch.stack([row[name].detach() for row in self._rows]).mean(0) for name in ("log_gain", "bias")}
+    def centre_exposure(self, share: float = 1.0) -> tuple[Array, Array]:
+        """Make the mean exposure of all views the neutral one: gain and bias (3,) that the map's colours must take.
+
+        The views' exposures become what ``share`` of them was.
+        """
+        for row in self._rows:
+            for name in _EXPOSURE:
+                row[name].data.mul_(share)
+        mean = {name: torch.stack([row[name].detach() for row in self._rows]).mean(0) for name in _EXPOSURE}
         gain = mean["log_gain"].exp()
         for row in self._rows:  # g c + b = (g / G) (G c + B) + b - (g / G) B
-            share = (row["log_gain"].detach() - mean["log_gain"]).exp()
-            row["bias"].data.sub_(share * mean["bias"])
+            ratio = (row["log_gain"].detach() - mean["log_gain"]).exp()
+            row["bias"].data.sub_(ratio * mean["bias"])
             row["log_gain"].data.sub_(mean["log_gain"])
         return gain.numpy(), mean["bias"].numpy()
 

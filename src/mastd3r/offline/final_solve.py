@@ -17,8 +17,10 @@ from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.bundle_adjustment import SolveReport
 from ..graph.initialisation import bootstrap
+from ..graph.intrinsics import RADIAL, without_radial
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
 from ..graph.observability import Observability
+from ..graph.radial_terms import radial_is_told
 from ..graph.submaps import bridge_submaps
 from ..graph.turning import observed, put_at_infinity
 from ..types import State, Trajectory
@@ -92,6 +94,11 @@ def turned_upright(graph: KeyframeGraph) -> tuple[str, dict[str, Any]]:
 
 def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
     graph.solve_all(config.graph.final_iterations // 2, 1.0)
+    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    if radial_is_told(graph):
+        return report
+    log.info("lens: no radial term that the video tells from none, k = %.4f", graph.intrinsics.values[RADIAL[0]])
+    graph.set_intrinsics(without_radial(graph.intrinsics))
     return graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
 
 
