@@ -126,6 +126,8 @@ def test_y4m_says_itself_what_it_is(colours: str) -> None:
         (CameraOptions(pixel_format="rgb24"), b"", "expected --size WxH of raw frames"),
         (CameraOptions(size=(4, 4), pixel_format="nv12"), b"", "expected one of bgr24, rgb24, gray8"),
         (CameraOptions(size=(0, 4)), b"", "expected sides of 1 to"),
+        (CameraOptions(size=(16000, 16000)), b"", "expected at most 80000000 pixels, got 16000x16000"),
+        (CameraOptions(), b"YUV4MPEG2 W16000 H16000 F25:1\n", "expected at most 80000000 pixels"),
     ],
 )
 def test_a_pipe_of_something_else_is_refused(options: CameraOptions, data: bytes, says: str) -> None:
@@ -349,3 +351,36 @@ def test_a_bag_says_what_is_in_it(tmp_path: Path) -> None:
     (tmp_path / "broken.mcap").write_bytes(b"no bag at all")
     with pytest.raises(InputError, match="expected a ROS bag"):
         open_camera(tmp_path / "broken.mcap", CameraOptions())
+
+
+@pytest.mark.parametrize(
+    ("of", "says"),
+    [
+        (lambda data: data[:60], "expected a ROS bag, got"),  # a message that is cut
+        (lambda data: data + b"\0" * 8, "expected a ROS bag, got"),  # one that is too long
+        (lambda data: data.replace(b"rgb8", b"abc8"), "expected an image of rgb8"),
+    ],
+)
+def test_a_bag_with_a_damaged_message_is_one_line(of: Callable[[bytes], bytes], says: str, tmp_path: Path) -> None:
+    def write(writer: Any, store: Any) -> None:
+        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
+        writer.write(
+            writer.add_connection("/a", kind, typestore=store), 1, of(bytes(store.serialize_cdr(message, kind)))
+        )
+
+    with pytest.raises(InputError, match=says) as caught:
+        open_camera(bag(tmp_path / "bag", write), CameraOptions())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bag_that_says_it_is_larger_than_memory(tmp_path: Path) -> None:
+    def write(writer: Any, store: Any) -> None:
+        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
+        writer.write(writer.add_connection("/a", kind, typestore=store), 1, store.serialize_cdr(message, kind))
+
+    file = next(bag(tmp_path / "bag", write).glob("*.mcap"))
+    data = bytearray(file.read_bytes())
+    data[9:17] = (2**62).to_bytes(8, "little")  # length of the first record
+    file.write_bytes(data)
+    with pytest.raises(InputError, match="expected a ROS bag, got"):
+        open_camera(file, CameraOptions())

@@ -133,6 +133,10 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
     assert any("stretched" in n for n in source.notes)
     patch_display_matrix(path, (0, 1, -1, 0))
     assert open_source(path, ALL).size == (48, 85)
+    path = tmp_path / "wider.y4m"
+    path.write_bytes(b"YUV4MPEG2 W64 H48 F30:1 A60000:1 C420\n" + (b"FRAME\n" + b"\x80" * (64 * 48 * 3 // 2)) * 2)
+    with pytest.raises(InputError, match="stretched as it asks for: expected at most 80000000 pixels"):
+        open_source(path, ALL)
 
 
 def test_an_mp4_without_its_index(tmp_path: Path) -> None:

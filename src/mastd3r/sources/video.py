@@ -312,6 +312,8 @@ def _read_contents(path: Path) -> _Contents:
             doubtful = stamps.pop()
             times = _times_of(stamps, stream.time_base, frame_s)
         aspect = stream.sample_aspect_ratio or Fraction(1)
+        shown_px = (round(stream.codec_context.width * aspect), stream.codec_context.height)
+        check_pixels((max(shown_px[0], 1), shown_px[1]), f"{path}, stretched as it asks for")
         order = int(getattr(stream.codec_context, "field_order", 0))  # PyAV 14 does not tell
         return _Contents(times, timed, frame_s, end if cut else None, doubtful, aspect, order)
 
