@@ -23,7 +23,7 @@ from local_server import file_server
 from mastd3r.concurrency import Newest
 from mastd3r.config import SourceConfig
 from mastd3r.errors import ConfigError, InputError
-from mastd3r.sources.camera import CameraFrame, CameraOptions, open_camera
+from mastd3r.sources.camera import WORDS, CameraFrame, CameraOptions, open_camera
 from mastd3r.sources.raw_frames import standard_input
 from rtsp_server import rtsp_server
 
@@ -274,6 +274,13 @@ def test_a_camera_that_is_not_there(tmp_path: Path) -> None:
 def test_an_option_of_another_camera_is_refused(what: str, options: CameraOptions, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         open_camera(what, options)
+
+
+@pytest.mark.parametrize("name", ["fps", "pace_fps", "timeout_s", "reconnect_s"])
+def test_numbers_of_a_camera_have_a_range(name: str) -> None:
+    for value in (float("nan"), float("inf"), -1.0, 1e300, *([] if name == "reconnect_s" else [0.0])):
+        with pytest.raises(ConfigError, match=f"--{WORDS.get(name, name)}: expected"):
+            CameraOptions(**{name: value})
 
 
 # -- what is played ------------------------------------------------------------------------------------------
