@@ -33,6 +33,8 @@ Array = NDArray[Any]
 FALLBACK_FPS = Fraction(30)
 GREY = "gray16le"
 LOCAL_ONLY = {"protocol_whitelist": "file"}  # a playlist reads nothing from the net
+# Texts that are no UTF-8 are let be; since PyAV 19 they always are, and its ``open`` takes no such word.
+BAD_METADATA: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 ATTACHED_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
@@ -251,7 +253,7 @@ def _converting(path: Path) -> Iterator[None]:
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first real video stream. Raises InputError."""
     try:
-        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, metadata_errors="replace")
+        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, **BAD_METADATA)
     except av.FFmpegError as e:
         raise InputError(f"{path}: {_why_not(path)}") from e
     with container:
