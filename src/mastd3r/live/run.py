@@ -18,7 +18,7 @@ from ..export.claim import RECORDED
 from ..export.run_folder import RunFolder
 from ..offline.reconstruction import Reconstruction
 from ..progress import Bar, Reporter, Silent
-from ..reading.files import user_path
+from ..reading.files import exists, user_path
 from ..registry import LARGEST, Range
 from ..sources.camera import CameraOptions, open_camera
 from ..sources.passing import KeptSource, PassingSource
@@ -78,7 +78,7 @@ def run_live(
         bar.advance()
     with loop:
         path = user_path(camera)
-        read = [path] if path.exists() and not path.is_char_device() else []
+        read = [path] if exists(path) and not path.is_char_device() else []
         with RunFolder(user_path(out, "out"), list(command), read, overwrite=overwrite) as folder:
             where = str((folder.home / RECORDED).resolve()) if record else opened.name
             folder.update(source={"path": where, "maps": None}, live={"recorded": record})

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import ConfigError, InputError
-from ..reading.files import user_path
+from ..reading.files import exists, user_path
 from ..registry import LARGEST, Range
 
 Array = NDArray[Any]
@@ -104,7 +104,7 @@ def open_camera(what: str | Path, options: CameraOptions, source: SourceConfig |
         return StreamCamera(words, options)
     _refuse(options, words, "reconnect_s")
     path = user_path(words)
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{words}: expected {EXPECTED}, or a video or folder to play, got no such path")
     from .ros_bag import RosBag, is_bag
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, MissingPackage
-from ..reading.files import short
+from ..reading.files import is_file, short
 from ..reading.pictures import check_pixels, decoded
 from .camera import CameraFrame, CameraOptions
 from .lost import changed
@@ -39,7 +39,7 @@ TO_RGB = {
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag: a file by its name, or a folder with rosbag2's metadata.yaml."""
-    return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+    return path.suffix in SUFFIXES if is_file(path) else is_file(path / "metadata.yaml")
 
 
 class RosBag:
