@@ -7,6 +7,7 @@ Stopped halfway (Ctrl-C, SIGTERM), it prints and writes the counts of what was d
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib
 import json
 import pkgutil
@@ -34,6 +35,7 @@ from fuzz import (  # noqa: F401  they register themselves
 from fuzz.case import KINDS, planned
 from fuzz.harness import FAULTS, Outcome, run_case
 from fuzz.material import Shared, aside, in_a_child
+from mastd3r.export.machine import machine_info
 
 SAVED_EVERY_S = 60.0
 STOPPED = 130
@@ -97,7 +99,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     warm()
     plan = planned(args.cases, args.seed, args.kind) if args.case is None else [(args.kind, args.case)]
-    tally = Tally(len(plan), args.out)
+    tally = Tally(len(plan), args.seed, args.out)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as temporary:
         root = args.keep or Path(temporary)
         shared_at = Path(temporary) / "shared"
@@ -123,9 +125,12 @@ def main() -> int:
 class Tally:
     """What is done so far; a file has it too, so that a round which is cut short has not been in vain."""
 
-    def __init__(self, planned_cases: int, out: Path | None) -> None:
+    def __init__(self, planned_cases: int, seed: int, out: Path | None) -> None:
         self.done: list[Outcome] = []
         self._planned, self._out = planned_cases, out
+        machine = machine_info()
+        self._made = {"seed": seed, "commit": machine["git_commit"], "date": str(datetime.date.today())}
+        self._made["processor"] = f"{machine['processor']}, {machine['cores']} cores"
         self._began = self._saved = time.monotonic()
 
     def add(self, outcome: Outcome) -> None:
@@ -137,7 +142,7 @@ class Tally:
     def save(self) -> dict[str, Any]:
         """Write the counts, and give them."""
         self._saved = time.monotonic()
-        summary = {"planned": self._planned, **summed(self.done, self._saved - self._began)}
+        summary = {"made": self._made, "planned": self._planned, **summed(self.done, self._saved - self._began)}
         if self._out is not None:
             part = self._out.with_name(f"{self._out.name}.part")
             part.write_text(json.dumps(summary, indent=1))

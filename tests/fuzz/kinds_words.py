@@ -220,7 +220,7 @@ def places_to_write(rng: random.Random, room: Room, shared: Shared) -> Case:
     out = rng.choice(
         (
             taken,
-            taken / "x",
+            other if taken.is_dir() else taken / "x",
             other,
             room.given,
             "/dev/null",
