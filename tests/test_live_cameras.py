@@ -252,7 +252,7 @@ def test_a_camera_that_is_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_camera_that_is_not_there(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
-    for what in ("77", "/dev/video77", f"http://127.0.0.1:{closed}/x.ts", "nothing_of_the_kind"):
+    for what in ("77", "/dev/video77", f"http://127.0.0.1:{closed}/x.ts", "nothing_of_the_kind", "9" * 200):
         with pytest.raises(InputError, match="expected") as caught:
             open_camera(what, FAST)
         assert "\n" not in str(caught.value)

@@ -17,7 +17,7 @@ from ..registry import LARGEST, Range
 
 Array = NDArray[Any]
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
-DEVICE = re.compile(r"\d+|/dev/.+")
+DEVICE = re.compile(r"[0-9]{1,4}|/dev/.+")
 TIMEOUT_S = 10.0
 WORDS = {"pace_fps": "pace", "reconnect_s": "reconnect", "timeout_s": "timeout", "pixel_format": "pixel-format"}
 RANGES = {  # of the numbers below; what the default is may be said too
