@@ -24,6 +24,7 @@ from mastd3r.concurrency import Newest
 from mastd3r.config import SourceConfig
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.sources.camera import WORDS, CameraFrame, CameraOptions, open_camera
+from mastd3r.sources.paced import paced
 from mastd3r.sources.raw_frames import standard_input
 from rtsp_server import rtsp_server
 
@@ -300,6 +301,15 @@ def test_a_folder_is_played_at_its_pace(tmp_path: Path) -> None:
     assert np.array_equal(own[2].image, fast[2].image)
 
 
+def test_a_clock_that_jumps_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("mastd3r.sources.paced.time.sleep", slept.append)
+    monkeypatch.setattr("mastd3r.sources.paced.time.perf_counter", lambda: 100 + sum(slept))
+    image = blobs(1)[0]
+    frames = list(paced(iter([(0.0, image), (1.0, image), (2e9, image), (2e9 + 0.5, image)])))
+    assert slept == [1.0, 5.0, 0.5] and [f.timestamp_s for f in frames] == [0.0, 1.0, 2e9, 2e9 + 0.5]
+
+
 def bag(path: Path, write: Callable[[Any, Any], None]) -> Path:
     store = get_typestore(Stores.ROS2_HUMBLE)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -360,6 +370,17 @@ def test_a_bag_says_what_is_in_it(tmp_path: Path) -> None:
         open_camera(tmp_path / "broken.mcap", CameraOptions())
 
 
+def one_image(of: Callable[[bytes], bytes]) -> Callable[[Any, Any], None]:
+    """What writes a bag of one image message, whose bytes were changed."""
+
+    def write(writer: Any, store: Any) -> None:
+        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
+        topic = writer.add_connection("/a", kind, typestore=store)
+        writer.write(topic, 1, of(bytes(store.serialize_cdr(message, kind))))
+
+    return write
+
+
 @pytest.mark.parametrize(
     ("of", "says"),
     [
@@ -369,23 +390,13 @@ def test_a_bag_says_what_is_in_it(tmp_path: Path) -> None:
     ],
 )
 def test_a_bag_with_a_damaged_message_is_one_line(of: Callable[[bytes], bytes], says: str, tmp_path: Path) -> None:
-    def write(writer: Any, store: Any) -> None:
-        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
-        writer.write(
-            writer.add_connection("/a", kind, typestore=store), 1, of(bytes(store.serialize_cdr(message, kind)))
-        )
-
     with pytest.raises(InputError, match=says) as caught:
-        open_camera(bag(tmp_path / "bag", write), CameraOptions())
+        open_camera(bag(tmp_path / "bag", one_image(of)), CameraOptions())
     assert "\n" not in str(caught.value)
 
 
 def test_a_bag_that_says_it_is_larger_than_memory(tmp_path: Path) -> None:
-    def write(writer: Any, store: Any) -> None:
-        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
-        writer.write(writer.add_connection("/a", kind, typestore=store), 1, store.serialize_cdr(message, kind))
-
-    file = next(bag(tmp_path / "bag", write).glob("*.mcap"))
+    file = next(bag(tmp_path / "bag", one_image(lambda data: data)).glob("*.mcap"))
     data = bytearray(file.read_bytes())
     data[9:17] = (2**62).to_bytes(8, "little")  # length of the first record
     file.write_bytes(data)
