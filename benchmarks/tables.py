@@ -3,9 +3,9 @@
 usage: python benchmarks/tables.py results.json docs/results.md
 
 Beside results.json: endurance.json, endless.json, corrections.json, networks.json, reference.json, masks.json,
-dense.json, live.json, localise.json, metric_scale.json, profile.json, segments.json, speed.json, stress.json,
-two_videos.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a folder plots
-beside the page, the curve of the stress suite beside it.
+dense.json, fuzz.json, live.json, localise.json, metric_scale.json, profile.json, segments.json, speed.json,
+stress.json, two_videos.json, and in bench/ the results.json of each bench under its suite's name. Plots go into a
+folder plots beside the page, the curve of the stress suite beside it.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from corrections_table import corrections
 from dense_table import dense
 from endless_table import endless
+from fuzz_table import fuzz
 from live_table import live
 from localise_table import localise
 from map_tables import map_sections
@@ -107,6 +108,7 @@ def main() -> int:
     lines += networks(source.parent / "networks.json")
     lines += masks(source.parent / "masks.json")
     lines += stress(source.parent / "stress.json", target.parent / PICTURE)
+    lines += fuzz(source.parent / "fuzz.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0
 

@@ -251,6 +251,22 @@ def test_bad_input_is_one_line_and_starts_nothing(tmp_path: Path, capsys: pytest
     assert not (tmp_path / "out" / "a").exists()
 
 
+def test_a_fault_of_ours_is_one_line_that_names_its_log(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = [sys.executable, "-c", "import sys; sys.exit('mastd3r: unexpected ValueError: 3; run.log holds it')"]
+    monkeypatch.setitem(Batch.__init__.__kwdefaults__, "program", failing)
+    listed = tmp_path / "list.txt"
+    listed.write_text("a.mp4\n" * 30)
+    assert main(["batch", str(listed), "--out", str(tmp_path / "out")]) == 1
+    lines = capsys.readouterr().err.splitlines()
+    log = tmp_path / "out" / "logs" / "a.log"
+    assert lines[-1] == (
+        f"mastd3r: batch: a ended by a fault of ours: unexpected ValueError: 3; run.log holds it; its log is {log}"
+    )
+    assert log.is_file() and sum("is named before" in line for line in lines) == 10 and "and 19 more" in lines[10]
+
+
 def test_a_second_batch_in_the_folder_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

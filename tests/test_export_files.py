@@ -8,11 +8,30 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mastd3r.errors import InputError
+from mastd3r.errors import InputError, OutputError
+from mastd3r.export.export_folder import export_folder
+from mastd3r.export.files import write_text
 from mastd3r.export.point_cloud import read_cloud, write_cloud
+from mastd3r.export.report_files import run_files
 from mastd3r.export.trajectory_files import read_tum, write_tum
 from mastd3r.reading.ply import read_vertices
 from mastd3r.types import StaticCloud, Trajectory
+
+
+@pytest.mark.parametrize("out", [".", "", "..", "/"])
+def test_what_has_no_name_of_its_own_is_refused(out: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(OutputError, match="expected a file with a name of its own"):
+        write_text(Path(out), "x")
+    with pytest.raises(OutputError, match="expected a folder with a name of its own"), export_folder(Path(out), {}, []):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_list_of_files_leaves_out_what_cannot_be_looked_at(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "cloud.ply").write_text("x")
+    assert [f.name for f in run_files(tmp_path)] == ["cloud.ply"]
 
 
 def test_trajectory_comes_back(tmp_path: Path) -> None:

@@ -238,6 +238,14 @@ def test_importing_is_light() -> None:
     assert not names & {"torch", "numba", "numpy", "cv2", "scipy"}
 
 
+def test_a_run_without_a_map_loads_no_torch(room_clip: Path, tmp_path: Path) -> None:
+    """It takes seconds, and gigabytes where pip brings CUDA: with ORB, no network is asked for anything either."""
+    words = ["run", str(room_clip), "--out", str(tmp_path / "run"), "--no-map", "--quiet", "--set", "features=orb"]
+    code = f"import sys; from mastd3r.cli.main import main; print(main({words!r}), 'torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=240)
+    assert said.stdout.strip().endswith("0 False"), said.stderr
+
+
 @pytest.mark.slow
 def test_a_live_loop_over_the_kitchen_is_its_run(tmp_path: Path) -> None:
     """Frames 0-79 from memory, two instances interleaved: the poses of ``mastd3r run --end 80``."""

@@ -1,4 +1,4 @@
-"""Cameras, streams, pipes and bags: what comes is what was sent, and whatever fails is a line and no crash."""
+"""Cameras, streams and pipes: what comes is what was sent, and whatever fails is a line and no crash."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,15 +15,14 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
 
 from helpers import blobs, write_video
 from local_server import file_server
 from mastd3r.concurrency import Newest
 from mastd3r.config import SourceConfig
 from mastd3r.errors import ConfigError, InputError
-from mastd3r.sources.camera import CameraFrame, CameraOptions, open_camera
+from mastd3r.sources.camera import WORDS, CameraFrame, CameraOptions, open_camera
+from mastd3r.sources.paced import paced
 from mastd3r.sources.raw_frames import standard_input
 from rtsp_server import rtsp_server
 
@@ -126,6 +125,8 @@ def test_y4m_says_itself_what_it_is(colours: str) -> None:
         (CameraOptions(pixel_format="rgb24"), b"", "expected --size WxH of raw frames"),
         (CameraOptions(size=(4, 4), pixel_format="nv12"), b"", "expected one of bgr24, rgb24, gray8"),
         (CameraOptions(size=(0, 4)), b"", "expected sides of 1 to"),
+        (CameraOptions(size=(16000, 16000)), b"", "expected at most 80000000 pixels, got 16000x16000"),
+        (CameraOptions(), b"YUV4MPEG2 W16000 H16000 F25:1\n", "expected at most 80000000 pixels"),
     ],
 )
 def test_a_pipe_of_something_else_is_refused(options: CameraOptions, data: bytes, says: str) -> None:
@@ -250,7 +251,7 @@ def test_a_camera_that_is_unplugged(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_camera_that_is_not_there(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         closed = server.getsockname()[1]
-    for what in ("77", "/dev/video77", f"http://127.0.0.1:{closed}/x.ts", "nothing_of_the_kind"):
+    for what in ("77", "/dev/video77", f"http://127.0.0.1:{closed}/x.ts", "nothing_of_the_kind", "9" * 200):
         with pytest.raises(InputError, match="expected") as caught:
             open_camera(what, FAST)
         assert "\n" not in str(caught.value)
@@ -274,6 +275,13 @@ def test_an_option_of_another_camera_is_refused(what: str, options: CameraOption
         open_camera(what, options)
 
 
+@pytest.mark.parametrize("name", ["fps", "pace_fps", "timeout_s", "reconnect_s"])
+def test_numbers_of_a_camera_have_a_range(name: str) -> None:
+    for value in (float("nan"), float("inf"), -1.0, 1e300, *([] if name == "reconnect_s" else [0.0])):
+        with pytest.raises(ConfigError, match=f"--{WORDS.get(name, name)}: expected"):
+            CameraOptions(**{name: value})
+
+
 # -- what is played ------------------------------------------------------------------------------------------
 
 
@@ -291,61 +299,10 @@ def test_a_folder_is_played_at_its_pace(tmp_path: Path) -> None:
     assert np.array_equal(own[2].image, fast[2].image)
 
 
-def bag(path: Path, write: Callable[[Any, Any], None]) -> Path:
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-        write(writer, store)
-    return path
-
-
-def image_message(store: Any, time_ns: int, image: Array, encoding: str) -> tuple[Any, str]:
-    """An image as ROS has it, its rows padded by 5 bytes."""
-    types = store.types
-    head = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(time_ns, 10**9)), "camera")
-    if encoding in ("png", "jpeg"):
-        data = cv2.imencode(f".{encoding}", image[..., ::-1])[1].ravel()
-        return types["sensor_msgs/msg/CompressedImage"](head, encoding, data), "sensor_msgs/msg/CompressedImage"
-    pixels = {"rgb8": image, "bgr8": image[..., ::-1], "mono8": image[..., :1]}[encoding]
-    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, 5)))
-    height, width = image.shape[:2]
-    message = types["sensor_msgs/msg/Image"](head, height, width, encoding, 0, rows.shape[1], rows.ravel())
-    return message, "sensor_msgs/msg/Image"
-
-
-@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "png"])
-def test_a_bag_is_played(encoding: str, tmp_path: Path) -> None:
-    images = blobs(3, 32, 24)
-
-    def write(writer: Any, store: Any) -> None:
-        kind = image_message(store, 0, images[0], encoding)[1]
-        topic = writer.add_connection("/cam/image", kind, typestore=store)
-        for n, image in enumerate(images):
-            time_ns = 5 * 10**9 + n * 50_000_000
-            message, _ = image_message(store, time_ns, image, encoding)
-            writer.write(topic, time_ns, store.serialize_cdr(message, kind))
-
-    folder = bag(tmp_path / "bag", write)
-    for path in (folder, next(folder.glob("*.mcap"))):
-        camera = open_camera(path, CameraOptions())
-        frames = list(camera.frames())
-        assert camera.size == (32, 24) and [f.timestamp_s for f in frames] == [0.0, 0.05, 0.1]
-        assert frames[-1].arrived_s - frames[0].arrived_s >= 0.099
-        for frame, image in zip(frames, images, strict=True):
-            assert np.array_equal(frame.image, image[..., [0, 0, 0]] if encoding == "mono8" else image)
-
-
-def test_a_bag_says_what_is_in_it(tmp_path: Path) -> None:
-    def write(writer: Any, store: Any) -> None:
-        for topic in ("/left", "/right"):
-            message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
-            writer.write(writer.add_connection(topic, kind, typestore=store), 1, store.serialize_cdr(message, kind))
-
-    folder = bag(tmp_path / "bag", write)
-    with pytest.raises(InputError, match="got 2: /left, /right; say which with --topic"):
-        open_camera(folder, CameraOptions())
-    with pytest.raises(InputError, match="expected one of the image topics /left, /right, got /up"):
-        open_camera(folder, CameraOptions(topic="/up"))
-    assert open_camera(folder, CameraOptions(topic="/right")).size == (64, 48)
-    (tmp_path / "broken.mcap").write_bytes(b"no bag at all")
-    with pytest.raises(InputError, match="expected a ROS bag"):
-        open_camera(tmp_path / "broken.mcap", CameraOptions())
+def test_a_clock_that_jumps_holds_nobody_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr("mastd3r.sources.paced.time.sleep", slept.append)
+    monkeypatch.setattr("mastd3r.sources.paced.time.perf_counter", lambda: 100 + sum(slept))
+    image = blobs(1)[0]
+    frames = list(paced(iter([(0.0, image), (1.0, image), (2e9, image), (2e9 + 0.5, image)])))
+    assert slept == [1.0, 5.0, 0.5] and [f.timestamp_s for f in frames] == [0.0, 1.0, 2e9, 2e9 + 0.5]

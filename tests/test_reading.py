@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from fuzz.material import npy_of, png_of, sparse
+from helpers import blobs
 from mastd3r.config import SourceConfig
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.run_record import checked_camera, checked_metrics, checked_record
@@ -193,6 +197,29 @@ def test_a_camera_and_figures_are_refused_by_the_name_of_their_field(tmp_path: P
     (tmp_path / "metrics.json").write_text('{"ate_rmse_all": "low"}')
     with pytest.raises(InputError, match=r"metrics\.json ate_rmse_all: expected a number"):
         checked_metrics(tmp_path / "metrics.json")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="files have no mode there")
+@pytest.mark.parametrize("shut", ["photos", "photos/rgb", "photos/rgb.txt", "run", "run/run.json"])
+def test_what_may_not_be_read_is_one_line(tmp_path: Path, shut: str) -> None:
+    (tmp_path / "photos" / "rgb").mkdir(parents=True)
+    (tmp_path / "photos" / "rgb.txt").write_text("0 rgb/0.png\n1 rgb/1.png\n")
+    for n in range(2):
+        Image.fromarray(blobs(1)[0]).save(tmp_path / f"photos/rgb/{n}.png")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "run.json").write_text("{}")
+    run = ["run", "photos", "--out", "out", "--no-map", "--quiet"]
+    commands = [run] if shut.startswith("photos") else [["eval", "run", "photos"], ["resume", "run"]]
+    code = f"import helpers, os; from mastd3r.cli.main import main; helpers.give_up_rights(); os.chmod({shut!r}, 0)"
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    words = [sys.executable, "-c", f"{code}; print([main(words) for words in {commands!r}])"]
+    done = subprocess.run(words, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    (tmp_path / shut).chmod(0o755)
+    lines = done.stderr.splitlines()
+    assert done.stdout.strip() == str([2] * len(commands)) and len(lines) == len(commands), done.stderr
+    assert all(line.startswith("mastd3r: ") and "expected" in line for line in lines), lines
+    told = ("permission denied", "may not be read", "got no rgb/0.png")
+    assert any(words in lines[0] for words in told), lines
 
 
 def test_reading_leaves_pipes_alone(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import av.error
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from mastd3r.config import SourceConfig
 from mastd3r.errors import ConfigError, InputError
 from mastd3r.sources import open_source
 from mastd3r.sources.image_files import read_rgb
-from mastd3r.sources.video import UPRIGHT, turn_of, turned
+from mastd3r.sources.turns import UPRIGHT, turn_of, turned
 
 ALL = SourceConfig()
 UNEVEN_MS = [100 + 33 * i + 11 * (i % 3) + (400 if i > 20 else 0) for i in range(40)]
@@ -133,6 +134,32 @@ def test_pixels_that_are_not_square_are_stretched(tmp_path: Path) -> None:
     assert any("stretched" in n for n in source.notes)
     patch_display_matrix(path, (0, 1, -1, 0))
     assert open_source(path, ALL).size == (48, 85)
+    path = tmp_path / "wider.y4m"
+    path.write_bytes(b"YUV4MPEG2 W64 H48 F30:1 A60000:1 C420\n" + (b"FRAME\n" + b"\x80" * (64 * 48 * 3 // 2)) * 2)
+    with pytest.raises(InputError, match="stretched as it asks for: expected at most 80000000 pixels"):
+        open_source(path, ALL)
+
+
+def test_pictures_that_ffmpeg_decodes_and_does_not_convert(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_video(tmp_path / "a.mp4", blobs(3))
+    source = open_source(path, ALL)
+
+    def refuse(*_: object) -> None:
+        raise av.error.OSError(95, "Operation not supported")
+
+    monkeypatch.setattr("mastd3r.sources.video.turned", refuse)
+    with pytest.raises(InputError, match=r"a\.mp4: expected pictures that can be shown as RGB"):
+        open_source(path, ALL)
+    with pytest.raises(InputError, match=r"a\.mp4: expected pictures that can be shown as RGB"):
+        list(source.frames())
+
+
+def test_a_video_that_has_gone_since_it_was_opened(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", blobs(3))
+    source = open_source(path, ALL)
+    path.unlink()
+    with pytest.raises(InputError, match=r"a\.mp4: expected a video, got no such"):
+        list(source.frames())
 
 
 def test_an_mp4_without_its_index(tmp_path: Path) -> None:

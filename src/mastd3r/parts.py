@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -89,10 +90,10 @@ def chosen_map_device(config: MappingConfig, notes: list[str]) -> str:
 
     Raises InputError, see ``map_device``. The options have been checked, as all are where they come in.
     """
-    from .mapping.rasterise import map_device
-
     if not config.enabled:
         return "cpu"
+    from .mapping.rasterise import map_device
+
     device, why = map_device(config.device, config.backend)
     notes.append(f"map on {device}" + (f", chosen by auto ({why})" if why else ""))
     log.info(notes[-1])
@@ -153,6 +154,15 @@ def _lack(what: str, title: str) -> str:
     if not weights.installed(what):
         return f"no {title} weights are installed"
     return "no accelerator" if _device() == "cpu" else ""
+
+
+def used_accelerator() -> tuple[str, float] | None:
+    """Its name, and the most MiB of it that this process has held; None where torch, which uses it, is not loaded."""
+    if "torch" not in sys.modules:
+        return None
+    from .mapping.rasterise import accelerator
+
+    return accelerator()
 
 
 def _device() -> str:

@@ -30,7 +30,7 @@ from .offline.segmented import TRACKED, Cut, Segments, cut, track_segments
 from .offline.tracked import MapMaterial
 from .parts import with_dataset_lens
 from .progress import Reporter, Silent
-from .reading.files import is_file, resolved, user_path, whole_text
+from .reading.files import is_closed, is_dir, is_file, resolved, user_path, whole_text
 from .reading.yaml_text import MOST_YAML_BYTES
 from .slam import Slam
 from .sources import open_source
@@ -197,9 +197,11 @@ def finish_live(run: str | Path, *, reporter: Reporter | None = None) -> Reconst
 
 
 def _what_is_in(path: Path) -> str:
-    if not path.is_dir():
+    if not is_dir(path):
         return "no such folder"
-    return "a complete one" if (path / "run.json").is_file() else "a folder without run.json of a run"
+    if is_closed(path):
+        return "one that may not be read"
+    return "a complete one" if is_file(path / "run.json") else "a folder without run.json of a run"
 
 
 def _absolute(path: str | Path) -> str:
@@ -208,8 +210,8 @@ def _absolute(path: str | Path) -> str:
 
 def _stopped_as(out: Path, slam: Slam, read: dict[str, Any]) -> Path | None:
     """The stopped run in ``out``, if it has checkpoints and read the same with the same options."""
-    stopped = stopped_run(out) if out.is_dir() else None
-    if stopped is None or not (stopped / CHECKPOINT).is_dir():
+    stopped = stopped_run(out) if is_dir(out) else None
+    if stopped is None or not is_dir(stopped / CHECKPOINT):
         return None
     record = read_record(stopped)
     was = record.get("source") or {}

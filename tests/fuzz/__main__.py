@@ -1,33 +1,61 @@
-"""``python -m fuzz``: a round of bad inputs; exit code 1 where a command did what none may do."""
+"""``python -m fuzz``: a round of bad inputs; exit code 1 where a command did what none may do.
+
+Stopped halfway (Ctrl-C, SIGTERM), it prints and writes the counts of what was done, and ends with 130; after a kill
+``--out`` has those up to a minute before.
+"""
 
 from __future__ import annotations
 
 import argparse
+import datetime
 import importlib
 import json
 import pkgutil
 import shutil
+import signal
 import sys
 import tempfile
 import time
+import types
+import webbrowser
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import miniatures
-from fuzz import kinds_download, kinds_maps, kinds_runs, kinds_sources, kinds_words  # noqa: F401  they register themselves
+from fuzz import (  # noqa: F401  they register themselves
+    kinds_download,
+    kinds_live,
+    kinds_many,
+    kinds_maps,
+    kinds_runs,
+    kinds_sources,
+    kinds_words,
+)
 from fuzz.case import KINDS, planned
 from fuzz.harness import FAULTS, Outcome, run_case
 from fuzz.material import Shared, aside, in_a_child
+from mastd3r.export.machine import machine_info
+
+SAVED_EVERY_S = 60.0
+STOPPED = 130
 
 
 def warm() -> None:
-    """Load what commands load, so that no case pays for it."""
+    """Load what commands load, so that no case pays for it; viewers end at once, loops begin cold."""
     import mastd3r
 
     for module in pkgutil.walk_packages(mastd3r.__path__, "mastd3r."):
         if not module.name.endswith(("__main__", "gsplat")):
             importlib.import_module(module.name)
+    loop, view = (importlib.import_module(f"mastd3r.{name}") for name in ("live.loop", "cli.view"))
+    webbrowser.open = lambda *_, **__: True  # type: ignore[assignment]
+    view.time = types.SimpleNamespace(sleep=_ctrl_c)  # whoever looks at a run has seen it at once
+    loop.warm_up = lambda *_: True
+
+
+def _ctrl_c(seconds: float) -> None:
+    raise KeyboardInterrupt
 
 
 def compile_kernels(root: Path, shared: Shared) -> None:
@@ -68,26 +96,58 @@ def main() -> int:
     p.add_argument("--quick", action="store_true", help="leave out what tracks or draws")
     p.add_argument("--out", type=Path, help="JSON with all counts")
     args = p.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     warm()
     plan = planned(args.cases, args.seed, args.kind) if args.case is None else [(args.kind, args.case)]
-    began, done = time.monotonic(), []
+    tally = Tally(len(plan), args.seed, args.out)
     with tempfile.TemporaryDirectory(prefix="fuzz-") as temporary:
         root = args.keep or Path(temporary)
         shared_at = Path(temporary) / "shared"
         shared_at.mkdir()
         shared = Shared(shared_at, args.quick)
-        if not args.quick:
-            compile_kernels(shared_at, shared)
-        for name, seed in plan:
-            outcome = run_case(name, seed, root, shared, keep=args.keep is not None)
-            done.append(outcome)
-            if outcome.faults or args.case is not None:
-                print(outcome, flush=True)
-    summary = summed(done, time.monotonic() - began)
+        try:
+            if not args.quick:
+                compile_kernels(shared_at, shared)
+            for name, seed in plan:
+                outcome = run_case(name, seed, root, shared, keep=args.keep is not None)
+                tally.add(outcome)
+                if outcome.faults or args.case is not None:
+                    print(outcome, flush=True)
+        except KeyboardInterrupt:
+            print(f"stopped after {len(tally.done)} of {len(plan)} cases", flush=True)
+    if not tally.done:
+        return STOPPED
+    summary = tally.save()
     print(as_table(summary))
-    if args.out is not None:
-        args.out.write_text(json.dumps(summary, indent=1))
-    return 1 if summary["faults"]["all"] else 0
+    return STOPPED if len(tally.done) < len(plan) else 1 if summary["faults"]["all"] else 0
+
+
+class Tally:
+    """What is done so far; a file has it too, so that a round which is cut short has not been in vain."""
+
+    def __init__(self, planned_cases: int, seed: int, out: Path | None) -> None:
+        self.done: list[Outcome] = []
+        self._planned, self._out = planned_cases, out
+        machine = machine_info()
+        self._made = {"seed": seed, "commit": machine["git_commit"], "date": str(datetime.date.today())}
+        self._made["processor"] = f"{machine['processor']}, {machine['cores']} cores"
+        self._began = self._saved = time.monotonic()
+
+    def add(self, outcome: Outcome) -> None:
+        """One more."""
+        self.done.append(outcome)
+        if time.monotonic() - self._saved > SAVED_EVERY_S:
+            self.save()
+
+    def save(self) -> dict[str, Any]:
+        """Write the counts, and give them."""
+        self._saved = time.monotonic()
+        summary = {"made": self._made, "planned": self._planned, **summed(self.done, self._saved - self._began)}
+        if self._out is not None:
+            part = self._out.with_name(f"{self._out.name}.part")
+            part.write_text(json.dumps(summary, indent=1))
+            part.replace(self._out)
+        return summary
 
 
 def summed(done: list[Outcome], wall_s: float) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ BLOCKED_S, KILLED_S = 40.0, 600.0  # one that does nothing for so long hangs, wh
 MOST_BYTES = 3 * 2**29  # 1.5 GiB
 ROOM_BYTES = 5 * 2**29  # of address space beside what the interpreter has mapped already
 HASHED_BYTES = 2**22  # of a file; larger ones are sparse
+LICENCES, MORE_SAID = ("download", "weights"), ("batch", "view")  # commands that say more on the way
 FAULTS = ("traceback", "hang", "running", "lines", "control", "memory", "changed", "code")
 
 
@@ -70,24 +72,33 @@ def _run(case: Case, room: Room, outcome: Outcome) -> None:
     pid = os.fork()
     if not pid:
         _child(case, room)
-    status, worked_s, last = None, 0.0, began
-    while status is None:
-        done, ended, usage = os.wait4(pid, os.WNOHANG)
-        if done:
-            status = ended
-        elif (now := _worked_s(pid)) > worked_s:
-            worked_s, last = now, time.monotonic()
-        elif time.monotonic() - last > BLOCKED_S or time.monotonic() - began > KILLED_S:
+    try:
+        status, usage = _waited_for(pid, began)
+    finally:
+        with suppress(ProcessLookupError):  # whatever it started, and itself where this is interrupted
             os.killpg(pid, signal.SIGKILL)
-            _, _, usage = os.wait4(pid, 0)
-            break
-        time.sleep(0.004)
     outcome.wall_s = time.monotonic() - began
     outcome.cpu_s = usage.ru_utime + usage.ru_stime
     outcome.peak_mib = usage.ru_maxrss / 1024
     outcome.code = None if status is None else os.waitstatus_to_exitcode(status)
     outcome.out, outcome.err = _text(room.path / "stdout"), _text(room.path / "stderr")
     outcome.log = "".join(_text(p) for p in sorted((room.path / "tmp").glob("mastd3r-*.log")))
+
+
+def _waited_for(pid: int, began: float) -> tuple[int | None, Any]:
+    """(status, usage) of a child that has ended; status None where it had to be killed."""
+    worked_s, last = 0.0, began
+    while True:
+        done, ended, usage = os.wait4(pid, os.WNOHANG)
+        now = time.monotonic()
+        if done:
+            return ended, usage
+        if (worked := _worked_s(pid)) > worked_s:
+            worked_s, last = worked, now
+        elif now - last > BLOCKED_S or now - began > KILLED_S:
+            os.killpg(pid, signal.SIGKILL)
+            return None, os.wait4(pid, 0)[2]
+        time.sleep(0.004)
 
 
 def _worked_s(pid: int) -> float:
@@ -158,8 +169,9 @@ def _judge(outcome: Outcome, before: dict[str, Any], after: dict[str, Any], runn
     lines = outcome.err.splitlines()
     ours = [line for line in lines if line.startswith("mastd3r: ")]
     rest = [line for line in lines if not line.startswith(("mastd3r: ", "WARNING", "ERROR"))]
-    if outcome.words[:1] in (["download"], ["weights"]):
-        rest = []  # a licence that is shown
+    command = (outcome.words or [""])[0]
+    if command in LICENCES or (command in MORE_SAID and "--quiet" not in outcome.words):
+        rest = []
     refused = outcome.code in (2, 130)
     shown = [c for c in outcome.out + outcome.err if not (c.isprintable() or c == "\n")]
     found = {
@@ -182,6 +194,6 @@ def _running(room: Room) -> set[Path]:
 def _is_running(path: Path) -> bool:
     try:
         record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return False
     return isinstance(record, dict) and record.get("status") == "running"

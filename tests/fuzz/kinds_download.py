@@ -112,17 +112,18 @@ def servers(rng: random.Random, room: Room, shared: Shared) -> Case:
     """A server whose answers are wrong in every way."""
     answer = rng.choice(ANSWERS)
     seed = rng.randrange(10**6)
-    port = _free_port(seed)
+    port = free_port()
     name = rng.choice(("x.safetensors", "x.pth", "n" * 300 + ".pth", "a%1b.pth", "[x].pth", "x.pth?a=b", "..%2fx.pth"))
     words: list[list[str | Path]] = [
         ["weights", "download", f"http://127.0.0.1:{port}/{name}", "--as", "mine", "--yes", "--quiet"],
         ["weights", "download", f"http://127.0.0.1:{port}/{name}", "--yes", "--quiet"],
         ["weights", "download", "owner/name", "--yes", "--quiet"],
     ]
-    return Case(rng.choice(words), partial(_serve, answer, port, seed), {"HF_ENDPOINT": f"http://127.0.0.1:{port}"})
+    return Case(rng.choice(words), partial(serve, answer, port, seed), {"HF_ENDPOINT": f"http://127.0.0.1:{port}"})
 
 
-def _free_port(seed: int) -> int:
+def free_port() -> int:
+    """One of this machine that nobody listens on."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -184,7 +185,8 @@ ANSWERS: tuple[Answer, ...] = (
 )
 
 
-def _serve(answer: Answer, port: int, seed: int) -> None:
+def serve(answer: Answer, port: int, seed: int) -> None:
+    """From now on this process has a server that answers so; downloads are not patient."""
     from mastd3r.download import datasets, fetch, weights_download
 
     server = socket.create_server(("127.0.0.1", port))

@@ -64,12 +64,6 @@ def commands_on(rng: random.Random, run: Path, room: Room, shared: Shared) -> li
     return rng.choice(words)
 
 
-def _no_browser() -> None:
-    import webbrowser
-
-    webbrowser.open = lambda url, *a, **k: True  # type: ignore[assignment]
-
-
 def copied(room: Room, shared: Shared) -> Path:
     """A good run that a command may write in."""
     return Path(shutil.copytree(shared.run, room.path / "run"))
@@ -88,7 +82,7 @@ def records(rng: random.Random, room: Room, shared: Shared) -> Case:
         for _ in range(rng.choice((1, 1, 3))):
             replace_somewhere(rng, data)
         (run / name).write_text(json.dumps(data if rng.random() < 0.95 else rng.choice(VALUES)))
-    return Case(commands_on(rng, run, room, shared), _no_browser)
+    return Case(commands_on(rng, run, room, shared))
 
 
 def replace_somewhere(rng: random.Random, data: Any) -> None:
@@ -126,7 +120,7 @@ def run_files(rng: random.Random, room: Room, shared: Shared) -> Case:
             path.unlink(missing_ok=True)
         elif data:
             path.write_bytes(garbled(rng, data))
-    return Case(commands_on(rng, run, room, shared), _no_browser)
+    return Case(commands_on(rng, run, room, shared))
 
 
 @kind("ply headers", 60)

@@ -17,6 +17,10 @@ from fuzz.material import NAMES, Shared, garbled, garbled_text, nasty, npy_of, p
 from helpers import blobs, write_video
 
 SUFFIXES = ("mp4", "mkv", "avi", "mov", "webm", "gif", "m3u8", "sdp", "ts", "y4m", "jpg", "txt", "concat", "mpd", "svg")
+HEADS = (
+    *(("W64 H48", "30:1", "60000:1"), ("W64 H48", "30:1", "1:60000"), ("W64 H48", "1:1000000", "1:1")),
+    *(("W64 H48", "1000000:1", "0:0"), ("W16000 H16000", "30:1", "1:1"), ("W2 H2", "0:0", "1:1")),
+)
 TEXTS = (
     "ffconcat version 1.0\nfile /etc/passwd\n",
     "#EXTM3U\n#EXTINF:10,\nfile:///etc/passwd\n",
@@ -24,6 +28,7 @@ TEXTS = (
     "YUV4MPEG2 W99999999 H99999999 F30:1\nFRAME\n",
     "<svg xmlns='http://www.w3.org/2000/svg' width='1e9'/>",
     "GIF89a" + "\xff" * 20,
+    *(f"YUV4MPEG2 {size} F{rate} A{aspect} C420\nFRAME\n" + "\x80" * 9000 for size, rate, aspect in HEADS),
 )
 SIZES = ((2, 2), (4000, 20), (20, 4000), (16, 16), (8000, 8), (1000, 2), (64, 2))
 

@@ -24,9 +24,18 @@ COMMANDS = (
     "download",
     "doctor",
     "live",
+    "finish",
+    "batch",
+    "save",
+    "localise",
     "scale",
 )
-OPTIONS = ("--seed", "--start", "--end", "--stride", "--map-minutes", "--intrinsics", "--quality", "--kind", "--preset")
+OPTIONS = (
+    *("--seed", "--start", "--end", "--stride", "--map-minutes", "--intrinsics", "--quality", "--kind", "--preset"),
+    *("--cloud", "--masks", "--semantics", "--correction", "--map-loss", "--scale", "--segment-frames", "--jobs"),
+    *("--memory-mib", "--retries", "--task-cores", "--task-gpus"),
+)
+WINDOW = ("start", "end", "stride", "intrinsics", "kind")
 YAML = (
     "!!int 'x'",
     "!!python/object/apply:os.system ['true']",
@@ -102,7 +111,10 @@ def option_values(rng: random.Random, room: Room, shared: Shared) -> Case:
         given = ",".join(rng.choice((number, "100", "50")) for _ in range(rng.choice((1, 4, 5, 8, 9))))
         return Case(short_run(room, shared, f"--intrinsics={given}"))
     words: list[list[str | Path]] = [
-        ["demo", f"--frames={rng.choice(('-1', '0', 'x', '29'))}", "--out", room.out],
+        ["demo", f"--frames={rng.choice(('-1', '0', 'x', '29', '999999999999'))}", "--out", room.out],
+        ["localise", shared.map, shared.one_image, "--out", room.out, f"--{rng.choice(WINDOW)}={number}"],
+        ["batch", shared.one_image, "--out", room.out, f"--jobs={number}", "--memory-mib=-1"],
+        ["view", shared.run, f"--port={number}", f"--file={number}"],
         ["bench", "local", "--data", room.given, "--out", room.out, f"--jobs={number}"],
         ["bench", "local", "--data", room.given, "--out", room.out, f"--memory-mib={number}"],
         ["bench", "local", "--data", room.given, "--out", room.out, "--list", "--seeds", number],
@@ -177,6 +189,18 @@ def names(rng: random.Random, room: Room, shared: Shared) -> Case:
         ["resume", path],
         ["map", path],
         ["bench", path, "--data", path, "--list"],
+        ["batch", path, "--out", room.out, f"--set={name}=1", "--quiet"],
+        ["live", "--out", room.out, "--quiet", "--timeout=1", "--end=1", f"--topic={name}", "--", path],
+        ["finish", path],
+        ["save", path, "--map", room.out],
+        ["save", shared.run, f"--map={room.path / 'out' / name}"],
+        ["localise", path, shared.one_image, "--out", room.out],
+        ["localise", shared.map, path, "--out", room.out],
+        ["run", shared.one_image, "--map", path, "--out", room.out, "--no-map", "--quiet"],
+        ["scale", path, f"factor={name}"],
+        ["scale", shutil.copytree(shared.run, room.path / "run"), name],
+        ["view", shared.run, f"--file={path}", "--no-browser"],
+        ["view", shared.run, f"--host={name}", "--no-browser"],
         ["weights", "check", path],
         ["weights", "download", path, "--yes"],
         ["weights", "path", path],
@@ -196,7 +220,7 @@ def places_to_write(rng: random.Random, room: Room, shared: Shared) -> Case:
     out = rng.choice(
         (
             taken,
-            taken / "x",
+            other if taken.is_dir() else taken / "x",
             other,
             room.given,
             "/dev/null",
@@ -236,6 +260,10 @@ def places_to_write(rng: random.Random, room: Room, shared: Shared) -> Case:
         ],
         ["bench", "local", "--data", room.given, f"--out={out}"],
         ["download", "tum", "fr1/xyz", f"--to={out}"],
+        ["batch", room.given / "none", f"--out={out}", "--no-map", "--quiet"],
+        ["live", shared.one_image, f"--out={out}", "--no-map", "--quiet", "--record"],
+        ["save", shared.run, f"--map={out}"],
+        ["localise", shared.map, shared.one_image, f"--out={out}"],
     ]
     return Case(rng.choice(words))
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 EXIT_FAULT = 1  # as main.py
 RETRIES = 2
+SHOWN = 10  # sources of a kind that the terminal names
 OWN = ("quiet", "overwrite")  # options of run that batch takes itself
 
 
@@ -104,7 +105,7 @@ def options_of(args: argparse.Namespace, of_run: Sequence[argparse.Action]) -> l
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
     from ..parts import chosen_pointmaps
-    from ..tasks.batch import MEMORY_MIB, NETWORK_MIB, Batch, claim_batch, sources_of
+    from ..tasks.batch import LOGS, MEMORY_MIB, NETWORK_MIB, Batch, claim_batch, sources_of
     from ..tasks.lock import alone_in
 
     options = options_of(args, args.of_run)
@@ -112,8 +113,10 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     sources, twice = sources_of(args.sources)
     guess_mib = NETWORK_MIB if chosen_pointmaps(config_from_args(args))[0] == "mast3r" else MEMORY_MIB
     said = Said(console, quiet=args.quiet)
-    for line in twice:
+    for line in twice[:SHOWN]:
         said.line(line)
+    if len(twice) > SHOWN:
+        said.line(f"and {len(twice) - SHOWN} more that are named before")
     claim_batch(args.out, sources)
     with alone_in(args.out, "batch") as lock:
         batch = Batch(args.out, sources, options, overwrite=args.overwrite, guess_mib=guess_mib)
@@ -125,7 +128,12 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     failed = [run for run in batch.runs.values() if run.state != "complete"]
     if not failed:
         return 0
-    if any(run.exit_code == EXIT_FAULT for run in failed):
+    fault = next((run for run in failed if run.exit_code == EXIT_FAULT), None)
+    if fault is not None:
+        from .main import say
+
+        log = batch.out / LOGS / f"{fault.name}.log"
+        say(f"batch: {fault.name} ended by a fault of ours: {fault.reason}; its log is {log}")
         return EXIT_FAULT
     more = f" and {len(failed) - 1} more" if len(failed) > 1 else ""
     raise InputError(f"batch: expected every run to be complete, got {failed[0].name} failed{more}: {failed[0].reason}")

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from ..config import Config, config_to_yaml, ranges
 from ..errors import ConfigError, InputError
+from ..registry import Range
 from .batch import segments_of
 from .options import checked_minutes, config_from_args
 from .screen import screen
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from ..offline.segmented import Segments
     from ..progress import Reporter
 
-DEMO_SEED = 0
+DEMO_SEED, DEMO_FRAMES = 0, Range(30, 10_000)
 DEMO_STEPS, DEMO_GAUSSIANS = 850, 30000  # of the 75 seconds on two cores, half
 
 
@@ -149,8 +150,7 @@ def demo(args: argparse.Namespace, console: Console) -> int:
     """``mastd3r demo``."""
     from ..sources.synthetic import make_room_clip
 
-    if args.frames < 30:
-        raise ConfigError(f"--frames: expected at least 30, got {args.frames}")
+    DEMO_FRAMES.check(args.frames, "--frames")
     with tempfile.TemporaryDirectory() as folder:
         clip = Path(folder) / "room"
         with console.status("making the clip: a furnished room with a moving ball"):

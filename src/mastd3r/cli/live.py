@@ -72,14 +72,13 @@ def live(args: argparse.Namespace, console: Console) -> int:
     from ..live import CameraOptions, run_live
     from .commands import reporter_of, show
 
-    seconds = {k: _seconds(args, k) for k in ("seconds", "timeout", "reconnect", "pace", "fps")}
-    given = {"timeout_s": seconds["timeout"], "reconnect_s": seconds["reconnect"]}
+    given = {"timeout_s": args.timeout, "reconnect_s": args.reconnect}
     options = CameraOptions(
         size=None if args.size is None else _size(args.size),
         pixel_format=args.pixel_format,
-        fps=seconds["fps"],
+        fps=args.fps,
         topic=args.topic,
-        pace_fps=seconds["pace"],
+        pace_fps=args.pace,
         **{k: v for k, v in given.items() if v is not None},
     )
     config = config_from_args(args)
@@ -90,7 +89,7 @@ def live(args: argparse.Namespace, console: Console) -> int:
             config,
             options=options,
             record=args.record,
-            seconds=seconds["seconds"],
+            seconds=args.seconds,
             overwrite=args.overwrite,
             command=args.words,
             reporter=reporter_of(args, console),
@@ -138,11 +137,3 @@ def _size(text: str) -> tuple[int, int]:
     if found is None:
         raise ConfigError(f"--size: expected WxH in pixels, such as 640x480, got {text!r}")
     return int(found[1]), int(found[2])
-
-
-def _seconds(args: argparse.Namespace, name: str) -> float | None:
-    """A number that must be above 0 where it is given. Raises ConfigError."""
-    value: float | None = getattr(args, name)
-    if value is not None and not 0 < value < float("inf"):
-        raise ConfigError(f"--{name}: expected a finite number above 0, got {value:g}")
-    return value

@@ -65,7 +65,7 @@ def _open_what_is_closed() -> None:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
 
 
-def say(line: str, error: BaseException) -> None:
+def say(line: str, error: BaseException | None = None) -> None:
     """The one line of a command that has not done its work, with what is known about ``error``."""
     text = plain("; ".join([f"mastd3r: {line}", *getattr(error, "__notes__", ())]), keep="")
     if sys.stderr is not None:  # it may be closed

@@ -9,6 +9,7 @@ import webbrowser
 from rich.console import Console
 
 from ..errors import ConfigError, InputError
+from ..reading.files import is_file
 from ..viewer.server import HOW_TO_GET, LOOPBACK, is_installed
 from .options import path
 from .screen import screen
@@ -53,7 +54,7 @@ def _open_report(args: argparse.Namespace) -> None:
     from ..export.read_run import read_run
 
     report = read_run(args.run).path / "report.html"
-    if not report.is_file():
+    if not is_file(report):
         raise InputError(f"{report}: expected the report of a complete run, got none")
     console = screen()
     if not args.report:

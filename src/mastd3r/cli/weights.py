@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..errors import ConfigError, InputError
+from ..reading.files import is_dir
 from .screen import screen
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def _download(args: argparse.Namespace, console: Console) -> int:
 
     with FileBars(Silent() if args.quiet else Terminal(console)) as bars:
         got = download(args.what, _accept(args.yes, console), as_name=args.as_name, watch=bars.watch)
-    if (got if got.is_dir() else got.parent).name not in KNOWN:
+    if (got if is_dir(got) else got.parent).name not in KNOWN:
         console.print("The licence of these weights is not known here: see the page that they come from.")
     screen().print(f"ready: {got}", highlight=False, soft_wrap=True, markup=False)
     return 0

@@ -25,7 +25,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, Any, cast
 
 from ..errors import InputError, OutputError
-from ..reading.files import check_plain, short
+from ..reading.files import check_plain, exists, short
 from .dataset_types import UNPACKED_LEAST_BYTES, UNPACKED_RATIO
 
 CHUNK_BYTES = 1 << 20
@@ -202,7 +202,7 @@ def _write(member: _Member, target: Path, name: str) -> None:
     with _disk(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         free = shutil.disk_usage(target.parent).free
-    if target.exists():
+    if exists(target):
         raise InputError(f"{name}: expected every file once, got {member.name} twice")
     if member.size_bytes > free:
         raise OutputError(

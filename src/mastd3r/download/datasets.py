@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import ConfigError, InputError, OutputError
-from ..reading.files import whole_json
+from ..reading.files import is_dir, is_file, whole_json
 from .archives import Damaged, unpack
 from .dataset_types import Archive, Dataset, Part, Sequence
 from .datasets_known import KNOWN
@@ -94,7 +94,7 @@ def kept_archives(dataset: Dataset, to: Path) -> list[Path]:
     """Archives that were kept because further sequences can come out of them."""
     names = {a.file_name for a in dataset.archives.values()}
     folder = to.expanduser() / dataset.name / ARCHIVES
-    return sorted(p for p in folder.iterdir() if p.name in names) if folder.is_dir() else []
+    return sorted(p for p in folder.iterdir() if p.name in names) if is_dir(folder) else []
 
 
 def _bring(dataset: Dataset, sequence: Sequence, folder: Path, watch: Watch | None) -> None:
@@ -109,13 +109,13 @@ def _bring(dataset: Dataset, sequence: Sequence, folder: Path, watch: Watch | No
             raise InputError(f"{e}; it was removed, the same command fetches it again") from e
         if part.archive not in dataset.shared:
             file.unlink(missing_ok=True)
-    if not (folder / sequence.folder).is_dir():
+    if not is_dir(folder / sequence.folder):
         raise InputError(f"{dataset.name} {sequence.name}: expected {sequence.folder} in its archives, got others")
 
 
 def _fetched(dataset: Dataset, archive: Archive, file: Path, watch: Watch | None) -> Path:
     """The archive's file; one that is there was whole when it got its name."""
-    if not file.is_file() or archive.size_bytes not in (None, file.stat().st_size):
+    if not is_file(file) or archive.size_bytes not in (None, file.stat().st_size):
         want = Wanted(size_bytes=archive.size_bytes, md5=archive.md5)
         fetch(f"{dataset.root}/{archive.path}", file, want, progress=watch(file.name) if watch else None)
     return file
@@ -153,7 +153,7 @@ def _move_into(source: Path, target: Path) -> None:
     """Move all entries; folders that are there are filled, files that are there are replaced. Raises OSError."""
     for entry in source.iterdir():
         place = target / entry.name
-        if entry.is_dir() and place.is_dir():
+        if is_dir(entry) and is_dir(place):
             _move_into(entry, place)
         else:
             os.replace(entry, place)
@@ -170,7 +170,7 @@ def _agree(dataset: Dataset, folder: Path, record: dict[str, Any], accept: Accep
 
 
 def _is_whole(folder: Path, sequence: Sequence, record: dict[str, Any]) -> bool:
-    return sequence.name in record["sequences"] and (folder / sequence.folder).is_dir()
+    return sequence.name in record["sequences"] and is_dir(folder / sequence.folder)
 
 
 def _read_record(folder: Path) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from ..errors import InputError, OutputError
-from ..reading.files import check_plain, short, user_path, whole_json, why
+from ..reading.files import check_plain, is_file, short, user_path, whole_json, why
 from .http import OPENER, whole_number
 
 CHUNK_BYTES = 1 << 20
@@ -92,7 +92,7 @@ def fetch(
     length, checksum or content, with the part removed.
     """
     user_path(_beside(target, ".part.json"), str(short(str(source))))  # the longest name of them
-    if want.sha256 and target.is_file() and sha256_of(target) == want.sha256:
+    if want.sha256 and is_file(target) and sha256_of(target) == want.sha256:
         return Fetched(target, target.stat().st_size, want.sha256, 0)
     with _writing(target):
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -167,7 +167,7 @@ class _Transfer:
         self.wait_s = 0.0  # that the server has asked for
 
     def have(self) -> int:
-        return self.part.stat().st_size if self.part.is_file() else 0
+        return self.part.stat().st_size if is_file(self.part) else 0
 
     def forget(self) -> None:
         """Begin again with the next request."""

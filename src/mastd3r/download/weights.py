@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..errors import ConfigError, InputError, OutputError
-from ..reading.files import check_plain, entries_of, whole_json
+from ..reading.files import check_plain, entries_of, is_dir, is_file, whole_json
 from .fetch import human_bytes, sha256_of
 from .weights_known import KNOWN, Known, Origin
 
@@ -91,7 +91,7 @@ def _entry(name: str) -> Entry:
     size = known.origins[0].files[-1].size_bytes if known else None
     if files is not None:
         size = sum(p.stat().st_size for p in files)
-    begun = folder.is_dir() and any(p.suffix in (*TENSORS, ".part") for p in folder.iterdir())
+    begun = is_dir(folder) and any(p.suffix in (*TENSORS, ".part") for p in folder.iterdir())
     what = known.what if known else f"from {read_record(folder).get('origin', 'an unknown place')}"
     licence = known.licence.title if known else "see its page"
     state: Literal["installed", "incomplete", "absent"] = "installed" if files else "incomplete" if begun else "absent"
@@ -126,12 +126,12 @@ def check(what: str) -> list[Checked]:
     """
     files: list[Path]
     if (own := own_path(what)) is not None:
-        files = [own] if own.is_file() else [p for p in entries_of(own) if p.suffix in TENSORS]
+        files = [own] if is_file(own) else [p for p in entries_of(own) if p.suffix in TENSORS]
     else:
         folder = folder_of(name_of(what))
         # A file of the wrong size is not present, but is what a check is there to find.
         expected = read_record(folder).get("files") or [f.name for o in origins_of(folder.name) for f in o.files]
-        files = [folder / n for n in expected if (folder / n).is_file()]
+        files = [folder / n for n in expected if is_file(folder / n)]
         if not any(p.suffix in TENSORS for p in files):
             raise InputError(absent(folder.name))
     if not files:
@@ -165,7 +165,7 @@ def _present(name: str) -> list[Path] | None:
     recorded = {n: r.get("bytes") for n, r in read_record(folder).get("files", {}).items()}
     ways = [{f.name: f.size_bytes or recorded.get(f.name) for f in o.files} for o in origins_of(name)]
     for way in ways or [recorded]:
-        sizes = {n: (folder / n).stat().st_size for n in way if (folder / n).is_file()}
+        sizes = {n: (folder / n).stat().st_size for n in way if is_file(folder / n)}
         if way and len(sizes) == len(way) and all(way[n] in (None, size) for n, size in sizes.items()):
             return sorted((folder / n for n in way), key=lambda p: (p.suffix not in TENSORS, p.name))
     return None
@@ -178,7 +178,7 @@ def absent(name: str, *, network: bool = True) -> str:
         return f"{name}: expected weights in {folder}, got none; mastd3r weights list shows what there is"
     origin, got = known.origins[0], "none"
     for file in (f for o in known.origins for f in o.files):
-        size = (folder / file.name).stat().st_size if (folder / file.name).is_file() else None
+        size = (folder / file.name).stat().st_size if is_file(folder / file.name) else None
         if size is not None and file.size_bytes not in (None, size):
             got = f"{file.name} of {size} bytes instead of {file.size_bytes}"
     what = " and ".join(f.name + (f" ({human_bytes(f.size_bytes)})" if f.size_bytes else "") for f in origin.files)
@@ -196,7 +196,7 @@ def origins_of(name: str) -> tuple[Origin, ...]:
 
 def own_path(what: str) -> Path | None:
     """A path that a user has given; names go first."""
-    if what in KNOWN or (is_name(what) and folder_of(what).is_dir()):
+    if what in KNOWN or (is_name(what) and is_dir(folder_of(what))):
         return None
     given = os.path.expanduser(what)
     if not os.path.exists(given):

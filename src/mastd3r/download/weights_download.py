@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import ConfigError, InputError
-from ..reading.files import entries_of, short, whole_json
+from ..reading.files import entries_of, is_dir, short, whole_json
 from .fetch import Progress, Unreachable, Wanted, fetch, local_path
 from .weights import (  # fmt: skip
     NAMELESS,
@@ -65,7 +65,7 @@ def download(what: str, accept: Accept, *, as_name: str | None = None, watch: Wa
             raise ConfigError(f"{what}: is {known.name} already, expected no --as")
         _agree(known.licence, accept)
     if loose:
-        return _carry_out(_folder_plan(own, as_name) if own and own.is_dir() else _file_plan(what, as_name), watch)
+        return _carry_out(_folder_plan(own, as_name) if own and is_dir(own) else _file_plan(what, as_name), watch)
     if known is None:
         return _carry_out(_hub_plan(what, as_name), watch)
     for origin in known.origins:
@@ -147,7 +147,7 @@ def _file_name(source: str) -> str:
 def _guess(source: str) -> str:
     """The name under which a loose file or folder is kept: that of the known weights it is, else its own."""
     local, file_name = local_path(source), _file_name(source)
-    stem = local.resolve().name if local is not None and local.is_dir() else Path(file_name).stem
+    stem = local.resolve().name if local is not None and is_dir(local) else Path(file_name).stem
     if stem in NAMELESS or not is_name(stem):
         raise ConfigError(f"{source}: expected a name for these weights, for instance --as mast3r")
     return next((k.name for k in KNOWN.values() if any(f.name == file_name for o in k.origins for f in o.files)), stem)

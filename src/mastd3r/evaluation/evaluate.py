@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..reading.files import whole_bytes, whole_text
+from ..reading.files import exists, is_file, whole_bytes, whole_text
 from ..reading.pictures import decoded
 from ..types import Frame, State, Trajectory, Truth
 from .image_error import psnr, ssim
@@ -80,7 +80,7 @@ def evaluate(
         ate = _add_trajectory_error(metrics, trajectory, truth)
         _add_keyframe_error(metrics, run_dir, truth)
     _add_holdout(metrics, holdout)
-    if (run_dir / "cloud.ply").is_file():
+    if is_file(run_dir / "cloud.ply"):
         metrics["cloud_mib"] = (run_dir / "cloud.ply").stat().st_size / 2**20
     _add_masks(metrics, _masks(run_dir, stamps, moving), has_truth=bool(moving))
     moving.tell()
@@ -182,7 +182,7 @@ def _degrees(angle_rad: float | None, over: float = 1.0) -> float | None:
 
 
 def _add_keyframe_error(metrics: dict[str, Any], run_dir: Path, truth: Truth) -> None:
-    if not (run_dir / "keyframes.txt").exists():
+    if not exists(run_dir / "keyframes.txt"):
         return
     times, positions = read_positions(run_dir / "keyframes.txt")
     kf = ate_of_positions(times, positions, truth.timestamps_s, truth.world_from_cam[:, :3, 3])
@@ -233,7 +233,7 @@ def _compare(frame: Frame, render_path: Path, moving: Array | None, has_masks: b
     fitted = psnr(_exposed(splat, photograph, use), photograph, use)
     alpha_path = render_path.parent.parent / "alpha" / render_path.name
     white = opaque = None
-    if alpha_path.is_file() and (alpha := read_mask(alpha_path) / 255).shape == use.shape:
+    if is_file(alpha_path) and (alpha := read_mask(alpha_path) / 255).shape == use.shape:
         white, opaque = psnr(splat + (1 - alpha)[..., None], photograph, use), float((alpha[use] > OPAQUE).mean())
     return HoldoutError(
         frame.timestamp_s, min(whole, PSNR_CEILING_DB), similar, capped, static_similar, white, fitted, opaque

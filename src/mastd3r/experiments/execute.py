@@ -10,6 +10,7 @@ from typing import Any
 
 from ..errors import ConfigError
 from ..export.files import writing
+from ..reading.files import exists
 from ..tasks.processes import Limits, Processes
 from ..tasks.runner import Change, Place, Task, run_tasks
 from .store import Store, command_of, record_of
@@ -72,7 +73,7 @@ def run_entries(
 
 def _fresh(folder: Path) -> Path:
     """What an interrupted run has left there goes."""
-    if folder.exists():
+    if exists(folder):
         with writing(folder):
             shutil.rmtree(folder)
     return folder

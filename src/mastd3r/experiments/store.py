@@ -17,7 +17,7 @@ from ..export.claim import claim_shelf
 from ..export.files import write_json, writing
 from ..export.machine import machine_info
 from ..export.read_run import read_json
-from ..reading.files import whole_json
+from ..reading.files import is_file, whole_json
 from ..registry import LARGEST
 from ..tasks.lock import alone_in
 from ..tasks.process import Ended
@@ -46,7 +46,7 @@ class Store:
     def get(self, entry: Entry) -> dict[str, Any] | None:
         """What is recorded of an entry, or None: it has not run, or its file is not one of ours."""
         path = self.entries / f"{entry.id}.json"
-        if not path.is_file():
+        if not is_file(path):
             return None
         try:
             data = read_json(path)
@@ -118,7 +118,7 @@ def record_of(entry: Entry, run: Path, ended: Ended, *, jobs: int) -> dict[str, 
         "machine": {**machine, "accelerator": told.get("accelerator")},
         **{key: told.get(key) for key in ("source", "timings_s", "choices")},
     }
-    if complete and (run / "aligned.txt").is_file():
+    if complete and is_file(run / "aligned.txt"):
         record["path"] = thinned(run / "aligned.txt")
     return record
 
@@ -203,7 +203,7 @@ def _joined(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
+    if not is_file(path):
         return {}
     try:
         return whole_json(path)

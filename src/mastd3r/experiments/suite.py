@@ -24,7 +24,7 @@ from ..config import Config, config_to_yaml, with_override
 from ..errors import ConfigError, InputError
 from ..export.metric_names import NAMES
 from ..reading.files import entries_of as entries_in
-from ..reading.files import is_file, short, user_path
+from ..reading.files import is_dir, is_file, short, user_path
 from ..reading.yaml_text import yaml_file, yaml_value
 from ..registry import LARGEST
 from .published import published_table
@@ -164,7 +164,7 @@ def suite_from_dict(data: Any, name: str) -> Suite:
 
 def sequences_of(suite: Suite, data: Path, names: Sequence[str] | None = None) -> tuple[SequenceSpec, ...]:
     """The suite's sequences, or those of ``names`` in their order. Raises InputError, ConfigError."""
-    if not data.is_dir():
+    if not is_dir(data):
         raise InputError(f"--data {data}: expected the folder that holds the sequences, got no such folder")
     if suite.sequences is not None:
         known = {s.name: s for s in suite.sequences}

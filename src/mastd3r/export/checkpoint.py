@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..reading.files import is_dir
 from ..types import WorkFrame
 from .files import replacing, writing
 
@@ -207,7 +208,7 @@ class CheckpointStore:
 
 def remove_checkpoints(folder: Path) -> None:
     """Remove the files of checkpoints, and the folder if that was all. Raises OSError."""
-    if not folder.is_dir():
+    if not is_dir(folder):
         return
     for path in (*folder.glob("state-*.ckpt*"), *folder.glob("arrays-*.bin")):
         path.unlink()

@@ -58,6 +58,8 @@ def export_folder(
 
 def _check(out: Path, kind: FolderKind) -> None:
     """Raise OutputError for a place where something else than an earlier folder of this kind is."""
+    if out.name in ("", ".."):  # what takes its place is made beside it
+        raise OutputError(f"{out}: expected a folder with a name of its own, got none; {ANOTHER}")
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         what = "a symbolic link" if out.is_symlink() else "a file"
         raise OutputError(f"{out}: expected to write a folder, got {what}; {ANOTHER}")

@@ -44,8 +44,10 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
     """A temporary beside ``path`` for the body to write; it takes the place of ``path`` only once the body is done.
 
-    ``suffix``: what its name must end with, where a writer goes by that.
+    ``suffix``: what its name must end with, where a writer goes by that. Raises OutputError.
     """
+    if path.name in ("", ".."):
+        raise OutputError(f"{path}: expected a file with a name of its own to write, got a folder")
     temporary = path.with_name(f"{path.name}.part{suffix}")
     with writing(path):
         try:

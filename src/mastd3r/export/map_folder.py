@@ -17,7 +17,7 @@ from ..camera.opencv_lens import OpenCvLens
 from ..camera.pinhole import Camera
 from ..errors import InputError
 from ..reading.arrays import arrays_of
-from ..reading.files import is_file, short, whole_json, whole_text
+from ..reading.files import is_dir, is_file, short, whole_json, whole_text
 from ..reading.pictures import MOST_PIXELS
 from ..reading.yaml_text import MOST_YAML_BYTES
 from .export_folder import FolderKind, export_folder
@@ -151,7 +151,7 @@ def _name(n: int) -> str:
 
 
 def _what_is_in(folder: Path) -> str:
-    if not folder.is_dir():
+    if not is_dir(folder):
         return "no such folder" if not os.path.lexists(folder) else "a file"
     if is_file(folder / "run.json"):
         return f"a run folder; mastd3r save {folder} --map MAP makes a map of it"

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.files import check_plain, first_bytes
 from ..reading.ply import read_ply, vertices_of
 from .files import write_bytes
 from .point_cloud import finite_points, vertex_colors
@@ -54,12 +55,8 @@ def ply_bytes(vertices_world: Array, faces: Array, colors: Array) -> bytes:
 
 def is_glb(path: Path) -> bool:
     """Whether a file is a binary glTF, by its first bytes. Raises InputError for one that is cut or cannot be read."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(12)
-        size = path.stat().st_size
-    except OSError as e:
-        raise InputError(f"{path}: expected a readable cloud or mesh, got {e.strerror or e}") from e
+    size = check_plain(path, "a readable cloud or mesh")
+    head = first_bytes(path, 12, "a readable cloud or mesh")
     if head[:4] != b"glTF":
         return False
     if len(head) < 12 or struct.unpack("<I", head[8:])[0] != size:

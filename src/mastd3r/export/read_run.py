@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..camera.pinhole import Camera
 from ..errors import InputError
-from ..reading.files import whole_bytes, whole_json, whole_text
+from ..reading.files import is_closed, whole_bytes, whole_json, whole_text
 from ..reading.pictures import decoded
 from ..reading.yaml_text import MOST_YAML_BYTES
 from ..types import State, StaticCloud, Trajectory
@@ -90,7 +90,8 @@ def read_run(path: Path | str) -> Run:
     """Load a run folder, complete or not. Raises InputError where run.json or trajectory.txt is missing."""
     folder = Path(path)
     if not os.path.lexists(folder / "run.json"):
-        raise InputError(f"{folder}: expected a run folder, got no run.json in it")
+        got = "one that may not be read" if is_closed(folder) else "no run.json in it"
+        raise InputError(f"{folder}: expected a run folder, got {got}")
     record = read_record(folder)
     trajectory = _poses(folder / "trajectory.txt")
     if os.path.lexists(folder / "keyframes.txt"):

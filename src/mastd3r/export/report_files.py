@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..reading.files import exists, is_closed, is_dir
 from .claim import CHECKPOINT, RECORD_FILE, UNFINISHED
 
 KNOWN = {
@@ -51,7 +52,9 @@ def run_files(folder: Path) -> tuple[RunFile, ...]:
     found = []
     for path in sorted(shown, key=lambda p: (order.get(p.name, len(order)), p.name)):
         words = KNOWN.get(path.name, "")
-        if not path.is_dir():
+        if is_closed(path) or not exists(path):  # somebody else's, or a link to nowhere
+            continue
+        if not is_dir(path):
             size = None if path.name in STILL_WRITTEN else path.stat().st_size
             found.append(RunFile(path.name, words, size))
         elif count := sum(1 for _ in path.iterdir()):

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from ..concurrency import one_blas_thread
 from ..config import Config, check_config
-from ..errors import ConfigError, reason_of
+from ..errors import reason_of
 from ..export.claim import RECORDED
 from ..export.run_folder import RunFolder
 from ..offline.reconstruction import Reconstruction
 from ..progress import Bar, Reporter, Silent
-from ..reading.files import user_path
+from ..reading.files import exists, user_path
+from ..registry import LARGEST, Range
 from ..sources.camera import CameraOptions, open_camera
 from ..sources.passing import KeptSource, PassingSource
 from ..types import StaticCloud
@@ -27,6 +28,7 @@ from .loop import LiveFrame, LiveLoop
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
+SECONDS = Range(0, LARGEST, above=True)
 LATENCY_EVERY_S = 1.0  # how late frames are is said anew no more often
 CLOUD_EVERY_S = 1.0  # a view gets the cloud no more often
 
@@ -64,8 +66,8 @@ def run_live(
     ``finish_live`` can make the rest. Interrupted before its second frame, and a second time, it raises.
     Raises SlamError children: where the camera is not there, before the folder is touched.
     """
-    if seconds is not None and not seconds > 0:
-        raise ConfigError(f"--seconds: expected a number above 0, got {seconds:g}")
+    if seconds is not None:
+        SECONDS.check(seconds, "--seconds")
     config = check_config(config or Config())
     opened = open_camera(camera, options or CameraOptions(), config.source)
     source = KeptSource(opened) if record else PassingSource(opened)
@@ -76,7 +78,7 @@ def run_live(
         bar.advance()
     with loop:
         path = user_path(camera)
-        read = [path] if path.exists() and not path.is_char_device() else []
+        read = [path] if exists(path) and not path.is_char_device() else []
         with RunFolder(user_path(out, "out"), list(command), read, overwrite=overwrite) as folder:
             where = str((folder.home / RECORDED).resolve()) if record else opened.name
             folder.update(source={"path": where, "maps": None}, live={"recorded": record})

@@ -25,6 +25,7 @@ Array = NDArray[Any]
 MOST, AFTER = 40, 4  # frames at most; and once there is a map
 STEP_RATIO = 0.012  # of the width, by which the nearest layer moves from frame to frame
 NEAR = (0.3, 0.6, 1.0)  # inverse depths of the layers
+LARGEST_SIDE_PX = 1280  # up to which pictures are made as large as the camera's
 STARTS_WITH = 3  # keyframes
 
 
@@ -57,6 +58,9 @@ def warm_up(config: Config, size: tuple[int, int]) -> bool:
 
 def _pictures(width: int, height: int) -> Iterator[Frame]:
     """Textured layers one behind the other, past which the camera moves."""
+    full_px = (width, height)
+    share = min(1.0, LARGEST_SIDE_PX / max(full_px))  # large ones are enlarged: noise for them takes minutes
+    width, height = (max(1, round(share * side)) for side in full_px)
     rng = np.random.default_rng(0)
     wide = width + int(STEP_RATIO * width * MOST) + 1
     layers = [(_noise(rng, wide, height, 3, 1.5), _noise(rng, wide, height, 1, width / 16) > 128) for _ in NEAR]
@@ -67,7 +71,7 @@ def _pictures(width: int, height: int) -> Iterator[Frame]:
             moved = cv2.warpAffine(texture, shift, (width, height), flags=cv2.INTER_LINEAR)
             there = cv2.warpAffine(opaque.astype(np.uint8), shift, (width, height)) > 0
             image = moved if k == 0 else np.where(there[..., None], moved, image)
-        yield Frame(n, n / 10, np.ascontiguousarray(image))
+        yield Frame(n, n / 10, np.ascontiguousarray(image if share == 1 else cv2.resize(image, full_px)))
 
 
 def _noise(rng: np.random.Generator, width: int, height: int, channels: int, blur_px: float) -> Array:

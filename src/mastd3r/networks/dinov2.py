@@ -19,6 +19,7 @@ from torch.nn.functional import interpolate
 
 from ..download.weights import path as weights_path
 from ..errors import InputError, MissingPackage
+from ..reading.files import is_file
 from .products import products
 from .record import Recorder
 
@@ -136,7 +137,7 @@ def _load(folder: Path) -> Any:
         from transformers import AutoConfig, Dinov2Model, Dinov2WithRegistersModel
     except ImportError as e:
         raise MissingPackage(f"DINOv2 needs transformers ({e}): pip install 'mastd3r-slam[networks]'") from e
-    if not (folder / "config.json").is_file():
+    if not is_file(folder / "config.json"):
         raise InputError(
             f"{folder}: expected a DINOv2 folder with config.json and model.safetensors, got no config.json"
         )

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import torch
 
 from ..errors import InputError
+from ..reading.files import is_file
 from .lighterglue import LighterGlue
 from .xfeat import XFeat
 
@@ -26,7 +27,7 @@ def shipped_networks(package: str) -> tuple[XFeat, LighterGlue]:
 
 def _file_of(package: str, name: str) -> Path:
     for file in metadata.files(package) or ():
-        if file.name == name and (path := Path(str(file.locate()))).is_file():
+        if file.name == name and is_file(path := Path(str(file.locate()))):
             return path
     raise InputError(f"features: expected {name} in the installed {package}, got no such file; install it again")
 

@@ -33,6 +33,7 @@ from ..mapping.quality import resolved
 from ..mapping.sh import sh_degree
 from ..parts import chosen_map_device
 from ..progress import Reporter
+from ..reading.files import is_file
 from ..types import Source, State, StaticCloud, View
 from .final_solve import FinalFrame, trajectory_of
 from .map_stage import TrainedMap, train_map, write_renders_and_flight
@@ -82,8 +83,8 @@ def start_of(run: Run) -> Start:
     splat, cloud = run.path / "gaussians.ply", run.path / "cloud.ply"
     nothing = np.zeros((0, 3), np.float32)
     empty = StaticCloud(nothing, nothing.astype(np.uint8), nothing[:, 0], nothing[:, 0], nothing[:, 0].astype(np.int32))
-    points = read_cloud(cloud) if cloud.is_file() else empty
-    if splat.is_file():
+    points = read_cloud(cloud) if is_file(cloud) else empty
+    if is_file(splat):
         return Start(points, read_gaussians_ply(splat))
     if not len(points.points_world):
         raise InputError(f"{run.path}: expected gaussians.ply or a cloud.ply with points, got a run without")
@@ -275,7 +276,7 @@ def _staged(run: Path) -> Iterator[Path]:
 
 def _put_in_place(staged: Path, run: Path) -> None:
     """Move every file over the run's own; run.json last."""
-    files = sorted(p for p in staged.rglob("*") if p.is_file())
+    files = sorted(p for p in staged.rglob("*") if is_file(p))
     with writing(run):
         for file in sorted(files, key=lambda p: p.name == "run.json"):
             target = run / file.relative_to(staged)

@@ -22,6 +22,7 @@ from ..export.read_run import Run
 from ..export.run_folder import stamp
 from ..export.tracks import Tracks
 from ..geometry.se3 import inverse
+from ..reading.files import is_file
 from ..types import Source, Trajectory
 from .exported_view import KEEP, ExportedView
 from .photographs import photographs, write_photograph
@@ -115,7 +116,7 @@ def colmap_of(run: Run, written: Written, view: ExportedView) -> ColmapModel:
     cam_from_world = np.stack([inverse(pose) for pose in written.trajectory.world_from_cam])
     camera_model, parameters = colmap_model(view.lens)
     common = (camera_model, parameters, (view.lens.width, view.lens.height), written.names, cam_from_world)
-    if not (run.path / "tracks.npz").is_file():
+    if not is_file(run.path / "tracks.npz"):
         log.warning(
             "%s has no tracks.npz (an older run): points are those of the cloud, without observations", run.path
         )

@@ -16,7 +16,7 @@ from ..errors import ConfigError
 from ..geometry.se3 import inverse, transform
 from ..graph.intrinsics import of_camera
 from ..graph.keyframe_graph import KeyframeGraph
-from ..mapping.gaussians import GaussianArrays
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..parts import Parts
 from ..pointmap.geometric import GeometricPointmaps
 from ..registry import AUTO

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ from ..export.read_run import read_run
 from ..export.run_folder import RunFolder
 from ..graph.focal_sigma import focal_facts
 from ..graph.initialisation import bootstrap
-from ..mapping.process import Outcome
-from ..mapping.rasterise import accelerator
+from ..parts import used_accelerator
 from ..progress import Reporter
 from ..tracking.depth_prior import own_depth_spread
 from ..tracking.memory import TrackingMemory
@@ -38,15 +37,17 @@ from ..types import MEASURED, Frame
 from .checkpoints import Checkpoints, JobMemory, Stage
 from .dense import write_dense_cloud_of
 from .final_solve import FinalFrame, final_frames, finish_graph, trajectory_of, turned_upright
-from .live_map import LiveMap
-from .map_stage import TrainedMap, train_map, write_renders_and_flight
 from .metres import in_lengths, scale_notes, scale_of_run
-from .placement import place_frames
 from .run_report import write_run_report
 from .smoothing import FrameMask, SmoothedMasks, SmoothingContext, smooth_masks
 from .static_cloud import static_cloud
 from .tracked import MapMaterial, Tracked
 from .tracks import static_tracks
+
+if TYPE_CHECKING:  # they load torch, which takes seconds: methods bring what a map needs
+    from ..mapping.process import Outcome
+    from .live_map import LiveMap
+    from .map_stage import TrainedMap
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -72,7 +73,11 @@ class RunJob:
         self._scale: dict[str, Any] | None = None  # run.json's: what metres were taken from
         self._evidence: EvidenceSample | None = None  # of the frame that shows most
         realtime = self.config.mapping.enabled and self.config.mapping.realtime
-        self._live = LiveMap(self.config, tracked.map_device) if realtime else None
+        self._live: LiveMap | None = None
+        if realtime:
+            from .live_map import LiveMap
+
+            self._live = LiveMap(self.config, tracked.map_device)
         self._begun: Outcome | None = None  # the map that was made while tracking
         self.checkpoints = checkpoints
         folder.write_config(config_to_yaml(self.config))
@@ -181,17 +186,11 @@ class RunJob:
         if not views or not len(cloud.points_world):
             self.folder.note(f"no map: {len(views)} frames can show it, {len(cloud.points_world)} points start it")
             return
+        from .map_stage import train_map, write_renders_and_flight
+
         with self.timed("map"):
-            trained = train_map(
-                self.folder,
-                self.config,
-                cloud,
-                views,
-                self.tracked.map_device,
-                self._begun,
-                self.reporter,
-                self.tracked.splat_before(),
-            )
+            where, before = self.tracked.map_device, self.tracked.splat_before()
+            trained = train_map(self.folder, self.config, cloud, views, where, self._begun, self.reporter, before)
         self.metrics |= trained.metrics
         if self.config.mapping.refine_poses and self.graph.started:
             self._place_frames(trained)
@@ -217,6 +216,8 @@ class RunJob:
 
     def _place_frames(self, trained: TrainedMap) -> None:
         """Every frame's pose read off the finished map, so that the trajectory agrees with the splat."""
+        from .placement import place_frames
+
         folder = self.folder
 
         def start(frame: FinalFrame) -> Array:
@@ -256,7 +257,7 @@ class RunJob:
             self.metrics["core_s_per_frame"] = sum(self.processor_s.values()) / self.frames
         if (sigma_ratio := self.folder.record["camera"]["focal_sigma_ratio"]) is not None:
             self.metrics["focal_sigma_ratio"] = sigma_ratio
-        if (card := accelerator()) is not None:
+        if (card := used_accelerator()) is not None:
             self.folder.update(accelerator=card[0])
             self.metrics["peak_gpu_mib"] = card[1]
         self.folder.write_metrics(self.metrics)

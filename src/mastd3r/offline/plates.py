@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from ..camera.map_view import MapView
 from ..export.read_run import Run
-from ..mapping.splat import NEAR_RATIO, Splat
 from .exported_view import MOVES_LEVEL, over_photograph
 from .renders import gaussians_of, lens_of, median_depth_of
 
@@ -24,6 +23,8 @@ class Plates:
 
     def __init__(self, run: Run) -> None:
         """Raises InputError for a run without a map."""
+        from ..mapping.splat import NEAR_RATIO, Splat  # loads torch
+
         self._splat = Splat(gaussians_of(run), NEAR_RATIO * median_depth_of(run))
         lens = lens_of(run)
         self._view = MapView(lens, lens.width, 1.0)

@@ -28,7 +28,7 @@ from ..export.point_cloud import read_cloud, read_points
 from ..export.read_run import Run, read_run
 from ..export.report import say_scale
 from ..export.run_folder import RunFolder
-from ..mapping.gaussians import GaussianArrays
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
 from ..metric.measure import measure
 from ..metric.spec import FORMS, absolute
@@ -36,7 +36,6 @@ from ..progress import Reporter, Silent
 from ..reading.files import is_file, user_path
 from ..sources import open_source
 from ..types import StaticCloud
-from .continued_map import continue_map
 from .dense import CLOUD_FILE, export_dense
 from .exports import export_pictures, export_plates
 from .map_making import save_run_as_map
@@ -244,6 +243,8 @@ class Reconstruction:
         if minutes is not None and not 0 < minutes < np.inf:
             raise ConfigError(f"minutes: expected a finite number above 0, got {minutes:g}")
         opened = open_source(self._photographs(source), self.config.source, want_semantic=False)
+        from .continued_map import continue_map  # loads torch
+
         trained = continue_map(self._run, opened, self.config, minutes, quality, reporter or Silent())
         self.__dict__.pop("gaussians", None)
         evaluation = evaluate(self.path, opened.truth(), opened.frames())

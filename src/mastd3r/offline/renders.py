@@ -23,8 +23,6 @@ from ..export.video import write_video
 from ..geometry.path import smoothed_path
 from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
-from ..mapping.splat import NEAR_RATIO, Splat
-from ..mapping.spz import write_gaussians_spz
 
 Array = NDArray[Any]
 Draw = Callable[[Array, Camera], tuple[Array, Array, Array]]
@@ -85,9 +83,13 @@ def export_splat(run: Run, kind: str, out: Path, *, all_poses: bool = False) -> 
         with writing(out):
             out.parent.mkdir(parents=True, exist_ok=True)
         with replacing(out) as part:
+            from ..mapping.spz import write_gaussians_spz  # loads torch
+
             write_gaussians_spz(part, gaussians)
         return out
     lens, median_depth = lens_of(run), median_depth_of(run)
+    from ..mapping.splat import NEAR_RATIO, Splat  # loads torch
+
     splat = Splat(gaussians, NEAR_RATIO * median_depth)
     if kind == "flight":
         with writing(out):

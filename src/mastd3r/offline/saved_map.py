@@ -21,7 +21,7 @@ from ..export.map_folder import SPLAT, MapRecord, read_map
 from ..geometry.se3 import inverse
 from ..graph.intrinsics import of_camera
 from ..graph.keyframe_graph import KeyframeGraph
-from ..mapping.gaussians import GaussianArrays
+from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
 from ..parts import Parts, chosen_features, parts_of
 from ..reading.files import is_file

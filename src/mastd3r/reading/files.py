@@ -50,8 +50,21 @@ def resolved(path: Path) -> Path:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is a plain file; False, too, for what cannot be asked for or looked at."""
+    """Whether there is a plain file; False, too, for what cannot be asked for or looked at.
+
+    These three stand for pathlib's own, which raise where a folder on the way may not be looked into.
+    """
     return os.path.isfile(path)
+
+
+def is_dir(path: Path) -> bool:
+    """Whether there is a folder; False as for ``is_file``."""
+    return os.path.isdir(path)
+
+
+def exists(path: Path) -> bool:
+    """Whether there is anything; False as for ``is_file``."""
+    return os.path.exists(path)
 
 
 def check_plain(path: Path, expected: str, refusal: Refusal = InputError, most: int | None = None) -> int:
@@ -75,6 +88,21 @@ def whole_bytes(path: Path, expected: str, refusal: Refusal = InputError, most: 
             return file.read(most)  # it may have grown
     except OSError as e:
         raise refusal(f"{path}: expected {expected}, got {why(e)}") from e
+
+
+def first_bytes(path: Path, count: int, expected: str, refusal: Refusal = InputError) -> bytes:
+    """What a plain file begins with. Raises InputError."""
+    check_plain(path, expected, refusal)
+    try:
+        with open(path, "rb") as file:
+            return file.read(count)
+    except OSError as e:
+        raise refusal(f"{path}: expected {expected}, got {why(e)}") from e
+
+
+def is_closed(folder: Path) -> bool:
+    """Whether a folder is there, and may not be looked into by this user."""
+    return os.path.isdir(folder) and not os.access(folder, os.R_OK | os.X_OK)
 
 
 def whole_text(path: Path, expected: str, refusal: Refusal = InputError, most: int = MOST_TEXT_BYTES) -> str:

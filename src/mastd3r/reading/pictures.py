@@ -49,6 +49,7 @@ def decoded(data: bytes, path: Path, mode: int) -> NDArray[Any]:
     try:
         with opened(io.BytesIO(data)) as whole:
             whole.load()  # OpenCV would speak to the terminal about what is wrong
+        del whole  # it is as large as what comes
         image = cv2.imdecode(np.frombuffer(data, np.uint8), mode)
     except (*BROKEN, cv2.error):
         image = None

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..config import SourceConfig
 from ..errors import InputError
 from ..geometry.se3 import nearest_rotation
+from ..reading.files import is_file
 from .image_files import read_rgb
 from .sequence import Wants
 from .tum import TumSource, file_rows
@@ -47,7 +48,7 @@ T_M = np.array(
 
 def looks_like(folder: Path) -> str | None:
     """What makes a TUM layout a sequence of this dataset, or None: times, names and size of its pictures."""
-    if not (folder / "rgb.txt").is_file():
+    if not is_file(folder / "rgb.txt"):
         return None
     try:
         first = file_rows(folder / "rgb.txt")[0]

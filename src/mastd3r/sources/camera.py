@@ -12,12 +12,20 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import ConfigError, InputError
-from ..reading.files import user_path
+from ..reading.files import exists, user_path
+from ..registry import LARGEST, Range
 
 Array = NDArray[Any]
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
-DEVICE = re.compile(r"\d+|/dev/.+")
+DEVICE = re.compile(r"[0-9]{1,4}|/dev/.+")
 TIMEOUT_S = 10.0
+WORDS = {"pace_fps": "pace", "reconnect_s": "reconnect", "timeout_s": "timeout", "pixel_format": "pixel-format"}
+RANGES = {  # of the numbers below; what the default is may be said too
+    "fps": Range(1e-3, 1e6),
+    "pace_fps": Range(1e-3, 1e6),
+    "timeout_s": Range(0, LARGEST, above=True),
+    "reconnect_s": Range(0, LARGEST),
+}
 EXPECTED = "a camera's number, a device, a URL (rtsp, http, udp, ...), - for frames on standard input, a ROS bag"
 
 
@@ -41,6 +49,12 @@ class CameraOptions:
     pace_fps: float | None = None  # of what is played: so many frames a second instead of its own times
     timeout_s: float = TIMEOUT_S  # without a frame, after which the camera is lost
     reconnect_s: float = 0.0  # for so long a lost stream or device is looked for again
+
+    def __post_init__(self) -> None:
+        """Raises ConfigError for a number out of its range."""
+        for name, allowed in RANGES.items():
+            if (value := getattr(self, name)) is not None:
+                allowed.check(value, f"--{WORDS.get(name, name)}")
 
 
 class Camera(Protocol):
@@ -90,7 +104,7 @@ def open_camera(what: str | Path, options: CameraOptions, source: SourceConfig |
         return StreamCamera(words, options)
     _refuse(options, words, "reconnect_s")
     path = user_path(words)
-    if not path.exists():
+    if not exists(path):
         raise InputError(f"{words}: expected {EXPECTED}, or a video or folder to play, got no such path")
     from .ros_bag import RosBag, is_bag
 
@@ -101,9 +115,6 @@ def open_camera(what: str | Path, options: CameraOptions, source: SourceConfig |
     from .paced import PacedSource
 
     return PacedSource(open_source(path, source or SourceConfig(), want_semantic=False), options.pace_fps)
-
-
-WORDS = {"pace_fps": "pace", "reconnect_s": "reconnect", "pixel_format": "pixel-format"}
 
 
 def _refuse(options: CameraOptions, what: str, *names: str) -> None:

@@ -39,10 +39,12 @@ class _Device:
         said = cv2.utils.logging  # type: ignore[attr-defined]
         before = said.setLogLevel(said.LOG_LEVEL_SILENT)  # what is wrong is said by us, in one line
         try:
-            self._capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
+            self._capture = cv2.VideoCapture(int(device) if device.isdecimal() else device)
+            there, image = self._capture.read() if self._capture.isOpened() else (False, None)
+        except cv2.error as e:
+            raise InputError(f"camera {device}: expected a camera, got what OpenCV does not open") from e
         finally:
             said.setLogLevel(before)
-        there, image = self._capture.read() if self._capture.isOpened() else (False, None)
         if not there or image is None:
             self._capture.release()
             raise InputError(f"camera {device}: expected a camera that gives pictures, got none; is it there and free?")

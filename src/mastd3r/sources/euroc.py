@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
-from ..reading.files import short, whole_text
+from ..reading.files import is_dir, is_file, short, whole_text
 from ..reading.yaml_text import MOST_YAML_BYTES, yaml_value
 from .sequence import Listed, Sequenced, check_times, read_lines, read_numbers, rigid, truth_or_note
 
@@ -30,7 +30,7 @@ TRUTH = "state_groundtruth_estimate0"
 def looks_like(folder: Path) -> str | None:
     """What makes a folder a sequence of EuRoC, or None."""
     inner = _inner(folder)
-    return f"{inner.name}/cam0/data.csv is there" if (inner / "cam0" / "data.csv").is_file() else None
+    return f"{inner.name}/cam0/data.csv is there" if is_file(inner / "cam0" / "data.csv") else None
 
 
 def find(folder: Path) -> Sequenced:
@@ -58,7 +58,7 @@ def find(folder: Path) -> Sequenced:
 
 
 def _truth(file: Path, body_from_cam: Array, notes: list[str]) -> tuple[Array, Array]:
-    if not file.is_file():
+    if not is_file(file):
         notes.append(f"no {TRUTH}/data.csv: no poses")
         return np.empty(0), np.empty((0, 4, 4))
     times, world_from_body = _body_poses(file)
@@ -67,7 +67,7 @@ def _truth(file: Path, body_from_cam: Array, notes: list[str]) -> tuple[Array, A
 
 
 def _inner(folder: Path) -> Path:
-    return folder / "mav0" if (folder / "mav0").is_dir() else folder
+    return folder / "mav0" if is_dir(folder / "mav0") else folder
 
 
 def _frames(cam: Path) -> list[Listed]:

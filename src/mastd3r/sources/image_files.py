@@ -32,7 +32,9 @@ def read_rgb(path: Path, grey_range: GreyRange = WHOLE) -> Array:
     image = _opened(path, "a readable image")
     if image.mode.startswith("I"):  # Pillow's modes of 16-bit grey files
         image = Image.fromarray(grey_range.as_8_bit(_grey_levels(image, path)))
-    return np.array(image.convert("RGB"))  # a copy of its own, writable
+    if image.mode != "RGB":
+        image = image.convert("RGB")
+    return np.array(image)  # a copy of its own, writable
 
 
 def stored_as_read(path: Path) -> bool:
@@ -93,7 +95,8 @@ def _opened(path: Path, expected: str) -> Image.Image:
     try:
         with opened(path) as image:
             image.load()
-            return ImageOps.exif_transpose(image)
+            ImageOps.exif_transpose(image, in_place=True)  # without a copy: of the largest each is a third of a GB
+            return image
     except FileNotFoundError as e:
         raise InputError(f"{path}: expected {expected}, got no such file") from e
     except BROKEN as e:

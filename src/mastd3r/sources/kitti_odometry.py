@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.se3 import inverse
+from ..reading.files import is_dir, is_file
 from .sequence import Listed, Sequenced, numbered, read_keyed, read_numbers, rigid_all, truth_or_note, without_gaps
 
 Array = NDArray[Any]
@@ -26,15 +27,15 @@ CAMERAS = ((2, "left colour"), (0, "left grey"))  # the first that is there
 
 def looks_like(folder: Path) -> str | None:
     """What makes a folder a sequence of KITTI odometry, or None."""
-    if not (folder / "times.txt").is_file():
+    if not is_file(folder / "times.txt"):
         return None
-    images = [f"image_{n}" for n, _ in CAMERAS if (folder / f"image_{n}").is_dir()]
+    images = [f"image_{n}" for n, _ in CAMERAS if is_dir(folder / f"image_{n}")]
     return f"times.txt and {images[0]} are there" if images else None
 
 
 def find(folder: Path) -> Sequenced:
     """Frames, times, poses and intrinsics of the left colour camera, else the left grey one. Raises InputError."""
-    chosen = next(((n, what) for n, what in CAMERAS if (folder / f"image_{n}").is_dir()), None)
+    chosen = next(((n, what) for n, what in CAMERAS if is_dir(folder / f"image_{n}")), None)
     if chosen is None:
         raise InputError(f"{folder}: expected image_2 or image_0, got neither")
     camera, what = chosen
@@ -83,4 +84,4 @@ def _pose_file(folder: Path) -> Path | None:
     """poses/NN.txt beside sequences/, as the archives unpack; or in the sequence's own folder."""
     here = folder.resolve()
     places = (here.parent.parent / "poses" / f"{here.name}.txt", here / f"{here.name}.txt", here / "poses.txt")
-    return next((p for p in places if p.is_file()), None)
+    return next((p for p in places if is_file(p)), None)

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import InputError
 from ..geometry.se3 import inverse
+from ..reading.files import is_dir, is_file
 from .kitti_odometry import camera_from_rectified, intrinsics_of
 from .sequence import (
     Listed,
@@ -44,14 +45,14 @@ def looks_like(folder: Path) -> str | None:
     """What makes a folder a drive of KITTI raw, or None."""
     for camera, _ in CAMERAS:
         images = folder / f"image_{camera}"
-        if (images / "data").is_dir() and (images / "timestamps.txt").is_file():
+        if is_dir(images / "data") and is_file(images / "timestamps.txt"):
             return f"image_{camera}/data and image_{camera}/timestamps.txt are there"
     return None
 
 
 def find(folder: Path) -> Sequenced:
     """Frames, times, poses of the camera from OXTS, and intrinsics. Raises InputError."""
-    chosen = next(((c, what) for c, what in CAMERAS if (folder / f"image_{c}" / "data").is_dir()), None)
+    chosen = next(((c, what) for c, what in CAMERAS if is_dir(folder / f"image_{c}" / "data")), None)
     if chosen is None:
         raise InputError(f"{folder}: expected image_02/data or image_00/data, got neither")
     camera, what = chosen
@@ -81,7 +82,7 @@ def find(folder: Path) -> Sequenced:
 
 
 def _truth(packets: Path, times: Array, cam_from_imu: Array, notes: list[str]) -> tuple[Array, Array]:
-    if not packets.is_dir():
+    if not is_dir(packets):
         notes.append("no oxts/data: no poses")
         return np.empty(0), np.empty((0, 4, 4))
     files = without_gaps(numbered(packets, "", ".txt", "packets"), len(times), "packets", packets)
@@ -127,7 +128,7 @@ def _packets(files: list[Path]) -> Array:
 
 def _calibration_folder(folder: Path) -> Path | None:
     here = folder.resolve()
-    return next((p for p in (here.parent, here) if (p / CALIBRATION[0]).is_file()), None)
+    return next((p for p in (here.parent, here) if is_file(p / CALIBRATION[0])), None)
 
 
 def _cam_from_imu(folder: Path, camera: str) -> tuple[Array, Array, tuple[int, int]]:

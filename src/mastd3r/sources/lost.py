@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.pictures import check_pixels
 from .camera import CameraFrame, CameraOptions, microseconds
 
 Array = NDArray[Any]
@@ -52,6 +53,7 @@ class Reconnecting:
         self._closed = threading.Event()
         self._connection: Connection | None = self.connect()
         self.size = self._connection.size
+        check_pixels(self.size, self.name)
         self._opened = time.monotonic()
 
     def connect(self) -> Connection:

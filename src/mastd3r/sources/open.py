@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..config import SourceConfig
 from ..errors import InputError
-from ..reading.files import entries_of, is_file, user_path
+from ..reading.files import entries_of, is_dir, is_file, user_path
 from ..types import Source
 from . import bonn, euroc, kitti_odometry, kitti_raw, replica, seven_scenes, tum_rgbd
 from .bonn import BonnSource
@@ -38,7 +38,7 @@ def _sequence(find: Callable[[Path], Sequenced]) -> Callable[[Path, SourceConfig
 
 
 def _tum(folder: Path, config: SourceConfig, wants: Wants, found: str) -> Source:
-    recording = tum_rgbd.recording_of(folder) if (folder / "rgb.txt").is_file() else None
+    recording = tum_rgbd.recording_of(folder) if is_file(folder / "rgb.txt") else None
     return TumSource(
         folder,
         config,
@@ -89,7 +89,7 @@ def open_source(
         from .video import VideoSource  # brings PyAV, which folders do not need
 
         return VideoSource(path, config, want_semantic=want_semantic, semantic_dir=semantic_dir)
-    if not path.is_dir():
+    if not is_dir(path):
         raise InputError(f"{path}: expected a file or a folder, got a named pipe, a socket or a device")
     if config.kind == "video":
         raise InputError(f"{path}: expected a video file, as --kind video says, got a folder")

@@ -12,12 +12,14 @@ from ..types import Source
 from .camera import CameraFrame, microseconds
 
 Array = NDArray[Any]
+LONGEST_PAUSE_S = 5.0  # a recording that was paused, or whose clock jumped by years, does not hold up whoever plays it
 
 
 def paced(items: Iterator[tuple[float, Array]], fps: float | None = None) -> Iterator[CameraFrame]:
     """(seconds, image) at the pace of their times, or ``fps`` a second; the next is made meanwhile.
 
-    The clock starts with the first. A frame that is made too late comes late: it has arrived when it is there.
+    The clock starts with the first; where the next is due later than in ``LONGEST_PAUSE_S``, it comes then. A frame
+    that is made too late comes late: it has arrived when it is there.
     """
     began = first_s = 0.0
     for n, (time_s, image) in enumerate(items):
@@ -26,7 +28,8 @@ def paced(items: Iterator[tuple[float, Array]], fps: float | None = None) -> Ite
             began, first_s = now, time_s
         due = began + (time_s - first_s if fps is None else n / fps)
         if due > now:
-            time.sleep(due - now)
+            began -= max(0.0, due - now - LONGEST_PAUSE_S)
+            time.sleep(min(due - now, LONGEST_PAUSE_S))
         yield CameraFrame(microseconds(time_s), image, time.perf_counter())
 
 

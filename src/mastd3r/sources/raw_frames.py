@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import ConfigError, InputError
+from ..reading.pictures import check_pixels
 from .camera import CameraFrame, CameraOptions, microseconds
 
 Array = NDArray[Any]
@@ -45,8 +46,9 @@ class RawFrames:
     ) -> None:
         """``picture`` makes (h, w, 3) uint8 RGB of (frame_bytes,) uint8; ``fps``: frames have times of their own.
 
-        ``marked``: a line goes before each frame.
+        ``marked``: a line goes before each frame. Raises InputError for more pixels than are ever read.
         """
+        check_pixels(size, name)
         self.name, self.size, self.said, self.notes = name, size, list[str](), list[str]()
         self.timeout_s: float | None = options.timeout_s
         self._pipe, self._bytes, self._picture, self._fps, self._marked = pipe, frame_bytes, picture, fps, marked

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
-from ..reading.files import short, whole_json
+from ..reading.files import is_dir, is_file, short, whole_json
 from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid_all, truth_or_note, without_gaps
 
 KIND = "replica"
@@ -23,7 +23,7 @@ KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 def looks_like(folder: Path) -> str | None:
     """What makes a folder a scene of Replica, or None."""
-    if not (folder / "results").is_dir():
+    if not is_dir(folder / "results"):
         return None
     first = next((folder / "results").glob("frame*.jpg"), None)
     return f"results/{first.name} and its like are there" if first is not None else None
@@ -40,7 +40,7 @@ def find(folder: Path) -> Sequenced:
     true_times, poses = truth_or_note(lambda: _truth(folder / "traj.txt", times), notes)
     file, camera = _camera(folder)
     frames = [
-        Listed(float(t), image, depth if depth.is_file() else None)
+        Listed(float(t), image, depth if is_file(depth) else None)
         for t, image, depth in zip(times, images, depths, strict=True)
     ]
     return Sequenced(
@@ -67,7 +67,7 @@ def _truth(file: Path, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _camera(folder: Path) -> tuple[Path, dict[str, float]]:
     """cam_params.json of the scene or of all scenes."""
     here = folder.resolve()
-    file = next((p for p in (here / "cam_params.json", here.parent / "cam_params.json") if p.is_file()), None)
+    file = next((p for p in (here / "cam_params.json", here.parent / "cam_params.json") if is_file(p)), None)
     if file is None:
         raise InputError(f"{folder}: expected cam_params.json in the folder or beside it, got none")
     try:

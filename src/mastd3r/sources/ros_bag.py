@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sqlite3
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, MissingPackage
+from ..reading.files import is_file, short
+from ..reading.pictures import check_pixels, decoded
 from .camera import CameraFrame, CameraOptions
 from .lost import changed
 from .paced import paced
@@ -18,6 +24,7 @@ from .paced import paced
 Array = NDArray[Any]
 PACKAGE = "a ROS bag needs the package rosbags: pip install 'mastd3r-slam[ros]'"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+MOST_SAID = 200  # characters of what rosbags says
 SUFFIXES = (".mcap", ".db3", ".bag")
 BAYER = {  # the mosaic by its first two pixels, as ROS names it: OpenCV's name is that of the second row
     "bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
@@ -32,7 +39,7 @@ TO_RGB = {
 
 def is_bag(path: Path) -> bool:
     """Whether a path is a bag: a file by its name, or a folder with rosbag2's metadata.yaml."""
-    return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
+    return path.suffix in SUFFIXES if is_file(path) else is_file(path / "metadata.yaml")
 
 
 class RosBag:
@@ -59,6 +66,7 @@ class RosBag:
             raise InputError(f"{path}: expected images on {self._topic}, got none")
         height, width = first[1].shape[:2]
         self.size = (width, height)
+        check_pixels(self.size, str(path))
 
     def frames(self) -> Iterator[CameraFrame]:
         """Frame after frame. Raises InputError for an image that cannot be read; one of another size ends it."""
@@ -72,7 +80,7 @@ class RosBag:
         """The reader ends with its iterator."""
 
     def _chosen(self, topic: str | None) -> str:
-        with self._reader() as reader:
+        with _opened(self._path) as reader:
             images = sorted({c.topic for c in reader.connections if c.msgtype in (IMAGE, COMPRESSED)})
         if topic is not None and topic not in images:
             raise InputError(f"--topic: expected one of the image topics {', '.join(images) or '(none)'}, got {topic}")
@@ -81,15 +89,9 @@ class RosBag:
             raise InputError(f"{self._path}: expected one topic of sensor_msgs/Image or CompressedImage, got {got}")
         return topic or images[0]
 
-    def _reader(self) -> Any:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-
-        return _Opened(self._path, lambda: AnyReader([self._path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)))
-
     def _images(self) -> Iterator[tuple[float, Array]]:
         """(seconds since the first image, the image); messages that do not rise in time are passed over."""
-        with self._reader() as reader:
+        with _opened(self._path) as reader:
             wanted = [c for c in reader.connections if c.topic == self._topic]
             first_ns, last_ns = None, -1
             for connection, logged_ns, raw in reader.messages(connections=wanted):
@@ -103,36 +105,41 @@ class RosBag:
                 yield last_ns * 1e-9, _picture(message, connection.msgtype, self._path)
 
 
-class _Opened:
-    """An open bag; what rosbags says of one that it cannot read becomes an InputError."""
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """An open bag. Raises InputError for what rosbags, or the packages that it reads with, say of a damaged one."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
 
-    def __init__(self, path: Path, make: Callable[[], Any]) -> None:
-        self._path, self._make = path, make
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+            yield reader
+    except _faults() as e:
+        said = " ".join(str(e).split()) or type(e).__name__
+        said = "a part that says it is larger than memory" if isinstance(e, MemoryError) else said
+        raise InputError(f"{path}: expected a ROS bag, got {short(said, MOST_SAID)}") from e
 
-    def __enter__(self) -> Any:
-        from rosbags.highlevel import AnyReaderError
 
-        try:
-            self._reader = self._make()
-            self._reader.open()
-        except (AnyReaderError, OSError, ValueError, KeyError) as e:
-            raise InputError(f"{self._path}: expected a ROS bag, got {' '.join(str(e).split())}") from e
-        return self._reader
+def _faults() -> tuple[type[Exception], ...]:
+    """What reading a damaged bag raises: rosbags' own errors have no common base, nor have those of its readers."""
+    from rosbags import highlevel, rosbag1, rosbag2, serde, typesys
 
-    def __exit__(self, *_: object) -> None:
-        self._reader.close()
+    own = (highlevel.AnyReaderError, rosbag1.ReaderError, rosbag2.ReaderError, serde.SerdeError, typesys.TypesysError)
+    bases = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, RuntimeError)
+    others = (("apsw", "Error"), ("backports.zstd", "ZstdError"), ("compression.zstd", "ZstdError"))
+    found = [getattr(sys.modules[name], kind) for name, kind in others if name in sys.modules]
+    return (*own, *bases, EOFError, MemoryError, struct.error, sqlite3.Error, *found)
 
 
 def _picture(message: Any, kind: str, path: Path) -> Array:
     """(h, w, 3) uint8 RGB of an image message. Raises InputError."""
     if kind == COMPRESSED:
-        image = cv2.imdecode(np.asarray(message.data, np.uint8), cv2.IMREAD_COLOR)
-        if image is None:
-            raise InputError(f"{path}: expected an image that can be decoded, got format {message.format!r}")
+        image = decoded(np.asarray(message.data, np.uint8).tobytes(), path, cv2.IMREAD_COLOR)
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
     height, width, encoding = message.height, message.width, message.encoding
     channels = CHANNELS.get(encoding)
-    if channels is None or message.step < width * channels or len(message.data) < height * message.step:
+    held = len(message.data) if width * height else -1
+    if channels is None or message.step < width * channels or held < height * message.step:
         raise InputError(
             f"{path}: expected an image of {', '.join(CHANNELS)}, got {encoding} of {width}x{height} in "
             f"{len(message.data)} bytes"

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..reading.files import is_file
 from .sequence import ASSUMED_FPS, Listed, Sequenced, numbered, read_numbers, rigid, truth_or_note
 
 KIND = "7scenes"
@@ -43,7 +44,7 @@ def find(folder: Path) -> Sequenced:
     notes = [f"no times: {ASSUMED_FPS:g} frames a second assumed", CAVEAT]
     true_times, matrices = truth_or_note(lambda: _truth(poses, times), notes)
     frames = [
-        Listed(float(t), image, depth if depth.is_file() else None)
+        Listed(float(t), image, depth if is_file(depth) else None)
         for t, image, depth in zip(times, images.values(), depths, strict=True)
     ]
     return Sequenced(
@@ -60,7 +61,7 @@ def find(folder: Path) -> Sequenced:
 
 
 def _truth(files: list[Path], times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    known = [p.is_file() for p in files]
+    known = [is_file(p) for p in files]
     if not any(known):
         return np.empty(0), np.empty((0, 4, 4))
     if not all(known):

@@ -9,9 +9,11 @@ from typing import Any
 
 import av
 import av.error
+import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..reading.pictures import check_pixels
 from .camera import CameraOptions
 from .lost import Connection, Lost, Reconnecting
 
@@ -89,8 +91,19 @@ class _Stream:
                     continue
                 now = time.perf_counter()
                 own_s = None if frame.pts is None else float(frame.pts * frame.time_base)
-                yield own_s, now, frame.to_ndarray(format="rgb24")
+                yield own_s, now, _rgb(frame)
         raise Lost("the stream ended" if tries is None or broken < tries else "no picture that can be decoded")
+
+
+def _rgb(frame: Any) -> Array:
+    """(h, w, 3) uint8. Raises Lost for what FFmpeg decodes, and does not convert, or is larger than is ever read."""
+    try:
+        check_pixels((frame.width, frame.height), "its pictures")
+        return np.asarray(frame.to_ndarray(format="rgb24"))
+    except (av.FFmpegError, ValueError) as e:
+        raise Lost(f"pictures of {frame.format.name} that cannot be shown as RGB") from e
+    except InputError as e:
+        raise Lost(str(e)) from e
 
 
 def _said(error: Exception, timeout_s: float) -> str:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from ..reading.files import first_bytes, is_file
+
 KIND = "tum"
 EXPECTED = "the TUM layout (rgb.txt with 'timestamp_s filename' lines)"
 # fx fy cx cy k1 k2 p1 p2 k3 of the colour cameras, pixels of 640x480: the benchmark's page on file formats, with the
@@ -27,12 +29,15 @@ HEAD_LINES, HEAD_BYTES = 10, 2**14
 
 def looks_like(folder: Path) -> str | None:
     """What makes a folder a TUM layout, or None."""
-    return "rgb.txt is there" if (folder / "rgb.txt").is_file() else None
+    return "rgb.txt is there" if is_file(folder / "rgb.txt") else None
 
 
 def recording_of(folder: Path) -> tuple[str, str] | None:
-    """The recording that rgb.txt names in its head and its camera, None where it names none of the benchmark's."""
-    with (folder / "rgb.txt").open("rb") as file:
-        lines = file.read(HEAD_BYTES).decode("utf-8-sig", "replace").splitlines()[:HEAD_LINES]
+    """The recording that rgb.txt names in its head and its camera, None where it names none of the benchmark's.
+
+    Raises InputError.
+    """
+    head = first_bytes(folder / "rgb.txt", HEAD_BYTES, "a readable list of images")
+    lines = head.decode("utf-8-sig", "replace").splitlines()[:HEAD_LINES]
     found = RECORDING.search("\n".join(line for line in lines if line.startswith("#")))
     return (found[0], found[1]) if found else None

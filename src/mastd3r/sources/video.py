@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ..config import SourceConfig
 from ..errors import InputError
-from ..reading.files import resolved
+from ..reading.files import resolved, why
 from ..reading.pictures import check_pixels
 from ..types import Frame, Truth
 from .checks import check_same_size, check_window, window
@@ -27,13 +27,14 @@ from .interlacing import deinterlaced, interlacing_of
 from .notes import Notes
 from .photographs import BrokenBeside
 from .semantic_maps import match_maps
+from .turns import UPRIGHT, turn_of_frame, turned
 
 Array = NDArray[Any]
-Turn = tuple[int, int, int, int]  # row-major 2x2 of 0, 1, -1: (x, y) as stored to (x, y) as shown
-UPRIGHT: Turn = (1, 0, 0, 1)
 FALLBACK_FPS = Fraction(30)
 GREY = "gray16le"
 LOCAL_ONLY = {"protocol_whitelist": "file"}  # a playlist reads nothing from the net
+# Texts that are no UTF-8 are let be; since PyAV 19 they always are, and its ``open`` takes no such word.
+BAD_METADATA: dict[str, Any] = {"metadata_errors": "replace"} if int(av.__version__.split(".")[0]) < 19 else {}
 ATTACHED_PICTURE = 0x400  # libavformat's AV_DISPOSITION_ATTACHED_PIC
 
 
@@ -62,28 +63,6 @@ class _Loss:
     """A packet that does not decode."""
 
     timestamp_s: float | None
-
-
-def turn_of(display_matrix: bytes) -> Turn:
-    """Nearest turn by quarters (with mirroring) of a 3x3 display matrix: nine int32, 16.16 fixed point.
-
-    The file stores [a b u; c d v; x y w] for x' = a x + c y, y' = b x + d y (ISO/IEC 14496-12, tkhd).
-    """
-    a, b, _, c, d = np.frombuffer(display_matrix, np.int32)[:5].astype(np.int64)
-    if max(abs(a), abs(d)) >= max(abs(b), abs(c)):
-        return (-1 if a < 0 else 1, 0, 0, -1 if d < 0 else 1)
-    return (0, -1 if c < 0 else 1, -1 if b < 0 else 1, 0)
-
-
-def turned(image: Array, turn: Turn) -> Array:
-    """(h, w, 3) as stored to (h, w, 3) or (w, h, 3) as shown."""
-    if turn[0] == 0:
-        image = image.transpose(1, 0, 2)
-    if turn[0] + turn[1] < 0:
-        image = image[:, ::-1]
-    if turn[2] + turn[3] < 0:
-        image = image[::-1]
-    return np.ascontiguousarray(image)
 
 
 class VideoSource:
@@ -115,13 +94,14 @@ class VideoSource:
         first = next(head, None)
         if first is None:
             raise InputError(f"{path}: expected a video, got {count} frames of which none can be decoded")
-        self._turn = _turn_of_frame(first.frame)
+        self._turn = turn_of_frame(first.frame)
         frames = (d.frame for d in chain([first], head))
-        self._interlacing = interlacing_of(frames, self._contents.field_order)
+        with _converting(path):
+            self._interlacing = interlacing_of(frames, self._contents.field_order)
+            self._grey = self._grey_range() if _is_deep_grey(first.frame) else None
+            height, width = self._rgb(first.frame).shape[:2]
         if self._interlacing is not None:
             self._notes.put("interlaced", self._interlacing.note)
-        self._grey = self._grey_range() if _is_deep_grey(first.frame) else None
-        height, width = self._rgb(first.frame).shape[:2]
         self.size = (width, height)
         self._semantic: dict[int, Path] = {}
         if semantic_dir is not None:
@@ -136,10 +116,14 @@ class VideoSource:
         decoded: Iterator[_Decoded] = self._decoded(note_end=True)
         if self._interlacing is not None:
             decoded = deinterlaced(decoded, self._interlacing)
-        for d in decoded:
-            if d.index not in self._chosen:
+        while True:
+            with _converting(self._path):
+                d = next(decoded, None)
+                image = None if d is None or d.index not in self._chosen else self._rgb(d.frame)
+            if d is None:
+                break
+            if image is None:
                 continue
-            image = self._rgb(d.frame)
             where = f"{self._path} frame {d.index} at {d.timestamp_s:.3f} s"
             check_same_size(image, where, self.size, "the first frame")
             semantic = None
@@ -256,10 +240,20 @@ class VideoSource:
 
 
 @contextmanager
+def _converting(path: Path) -> Iterator[None]:
+    """Raises InputError for sizes and formats that FFmpeg decodes, and then does not convert."""
+    try:
+        yield
+    except av.FFmpegError as e:
+        got = " ".join(str(e).split())
+        raise InputError(f"{path}: expected pictures that can be shown as RGB, got some that cannot ({got})") from e
+
+
+@contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its first real video stream. Raises InputError."""
     try:
-        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, metadata_errors="replace")
+        container = av.open(str(resolved(path)), container_options=LOCAL_ONLY, **BAD_METADATA)
     except av.FFmpegError as e:
         raise InputError(f"{path}: {_why_not(path)}") from e
     with container:
@@ -281,8 +275,11 @@ def _is_picture(stream: Any) -> bool:
 
 
 def _why_not(path: Path) -> str:
-    with path.open("rb") as f:
-        head = f.read(16)
+    try:
+        with path.open("rb") as f:
+            head = f.read(16)
+    except OSError as e:
+        return f"expected a video, got {why(e)}"
     if not head:
         return "expected a video, got an empty file"
     if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide"):
@@ -312,6 +309,8 @@ def _read_contents(path: Path) -> _Contents:
             doubtful = stamps.pop()
             times = _times_of(stamps, stream.time_base, frame_s)
         aspect = stream.sample_aspect_ratio or Fraction(1)
+        shown_px = (round(stream.codec_context.width * aspect), stream.codec_context.height)
+        check_pixels(shown_px, f"{path}, stretched as it asks for")
         order = int(getattr(stream.codec_context, "field_order", 0))  # PyAV 14 does not tell
         return _Contents(times, timed, frame_s, end if cut else None, doubtful, aspect, order)
 
@@ -389,9 +388,3 @@ def _frames_at(path: Path, contents: _Contents, indices: list[int]) -> Iterator[
                 yield next(container.decode(stream))
             except (av.FFmpegError, StopIteration):
                 continue
-
-
-def _turn_of_frame(frame: Any) -> Turn:
-    """The turn that a frame asks for. Only for the first: a frame whose side data was read is freed late."""
-    matrix = frame.side_data.get("DISPLAYMATRIX")  # by name: what iterating gives is another thing since PyAV 19
-    return UPRIGHT if matrix is None else turn_of(bytes(matrix))

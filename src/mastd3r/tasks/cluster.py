@@ -269,7 +269,7 @@ def _check_answers(address: str) -> None:
             raise InputError(f"{expected}, got no answer ({e.strerror or e})") from e
     try:
         words = [sys.executable, "-c", PROBE, address]
-        asked = subprocess.run(words, capture_output=True, text=True, timeout=ANSWER_S, check=False)
+        asked = subprocess.run(words, capture_output=True, text=True, errors="replace", timeout=ANSWER_S, check=False)
     except subprocess.TimeoutExpired as e:
         raise InputError(f"{expected}, got no answer within {ANSWER_S:.0f} s") from e
     if asked.returncode:

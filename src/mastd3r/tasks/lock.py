@@ -10,6 +10,7 @@ from pathlib import Path
 from ..errors import OutputError
 from ..export.claim import LOCK
 from ..export.files import writing
+from ..reading.files import check_plain
 
 LOCK_WAIT_S = 15.0  # tasks of a command that was killed end by themselves within seconds
 
@@ -27,7 +28,9 @@ def alone_in(folder: Path, what: str) -> Iterator[int | None]:
         return
     with writing(folder):
         (folder / LOCK).touch()
-    with open(folder / LOCK) as file:
+        check_plain(folder / LOCK, "a file for its lock", OutputError)
+        file = open(folder / LOCK)  # noqa: SIM115  it is closed below, its errors are of writing
+    with file:
         end = time.monotonic() + LOCK_WAIT_S
         while True:
             try:

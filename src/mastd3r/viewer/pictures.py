@@ -13,6 +13,7 @@ from ..config import SourceConfig, config_from_text
 from ..errors import InputError, SlamError
 from ..export.read_run import Run
 from ..export.run_folder import stamp
+from ..reading.files import exists, is_file
 
 Array = NDArray[Any]
 ImageAt = Callable[[float], Array | None]  # (h, w, 3) uint8 RGB of a time, None where there is none
@@ -63,7 +64,7 @@ class Pictures:
 
         try:
             path = Path(str((self._run.record.get("source") or {}).get("path") or ""))
-            if not path.name or not path.exists():
+            if not path.name or not exists(path):
                 raise InputError(f"photographs: expected at source.path of run.json, got no such path as {str(path)!r}")
             source = open_source(path, self._source_config(), want_semantic=False)
             self._photograph = getattr(source, "image_at", None)
@@ -71,7 +72,7 @@ class Pictures:
         except (SlamError, OSError, AttributeError) as e:
             self._why_not = " ".join(str(e).split())
         video, times = self._run.path / VIDEO, self._run.mask_times_s()
-        if video.is_file() and len(times):
+        if is_file(video) and len(times):
             self._video = self._video_from(video, float(times[0]))
 
     def _source_config(self) -> SourceConfig:
@@ -102,11 +103,11 @@ class Pictures:
 
     def _render(self, timestamp_s: float) -> Array | None:
         file = self._run.path / "renders" / f"{stamp(timestamp_s)}.png"
-        return self._run.render(timestamp_s) if file.is_file() else None
+        return self._run.render(timestamp_s) if is_file(file) else None
 
     def _mask(self, timestamp_s: float) -> tuple[Array | None, str]:
         """P(moving), and what is to be said of it."""
-        if not (self._run.path / "masks" / f"{stamp(timestamp_s)}.png").is_file():
+        if not is_file(self._run.path / "masks" / f"{stamp(timestamp_s)}.png"):
             return None, "; no mask of this frame"
         try:
             return self._run.mask(timestamp_s), ""

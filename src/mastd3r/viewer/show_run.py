@@ -18,7 +18,7 @@ from ..export.run_folder import stamp
 from ..export.trajectory_files import read_states
 from ..mapping.gaussian_arrays import GaussianArrays
 from ..mapping.ply import read_gaussians_ply
-from ..reading.files import whole_bytes
+from ..reading.files import is_file, whole_bytes
 from ..types import State
 from .pictures import Pictures
 from .scene import Scene
@@ -97,13 +97,13 @@ def read_content(path: Path, files: Sequence[Path] = ()) -> Content:
     """What a run folder holds. Raises InputError."""
     run = read_run(path)
     content = Content(run, frames_of(run), notices=_status(run))
-    if (path / SPLAT).is_file():
+    if is_file(path / SPLAT):
         content.splat = read_gaussians_ply(path / SPLAT)
-    if (path / SPARSE).is_file():
+    if is_file(path / SPARSE):
         points, colours, spacing = read_coloured_points(path / SPARSE)
         typical = None if spacing is None or not len(spacing) else POINT_RATIO * float(np.median(spacing))
         content.sparse = (points, colours, typical)
-    here = [path / name for name in (DENSE, *MESHES) if (path / name).is_file()]
+    here = [path / name for name in (DENSE, *MESHES) if is_file(path / name)]
     for file in [*here, *files]:
         if is_glb(file):
             content.mesh = whole_bytes(file, "a readable mesh")
@@ -111,7 +111,7 @@ def read_content(path: Path, files: Sequence[Path] = ()) -> Content:
             content.mesh = glb_bytes(*read_mesh(file))
         else:
             content.dense = read_coloured_points(file)[:2]
-    content.notices += [line for name, line in MISSING.items() if not (path / name).is_file()]
+    content.notices += [line for name, line in MISSING.items() if not is_file(path / name)]
     if run.camera is None:
         content.notices.append("No lens: no camera.json in this folder; the field of view is assumed.")
     if all(pose is None for _, pose, _ in content.frames):
@@ -124,7 +124,7 @@ def frames_of(run: Run) -> list[tuple[float, Array | None, State]]:
     trajectory = run.trajectory
     posed = zip(trajectory.timestamps_s, trajectory.world_from_cam, trajectory.states, strict=True)
     rows: dict[str, tuple[float, Array | None, State]] = {stamp(float(t)): (float(t), p, s) for t, p, s in posed}
-    if (run.path / "states.txt").is_file():
+    if is_file(run.path / "states.txt"):
         for time_s, state in read_states(run.path / "states.txt"):
             _, pose, _ = rows.get(stamp(time_s), (time_s, None, state))
             rows[stamp(time_s)] = (time_s, pose, state)

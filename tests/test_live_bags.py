@@ -1,0 +1,114 @@
+"""ROS bags: what is played is what was recorded, and whatever is damaged is a line and no crash."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from helpers import blobs
+from mastd3r.errors import InputError
+from mastd3r.sources.camera import CameraOptions, open_camera
+
+Array = NDArray[Any]
+
+
+def bag(path: Path, write: Callable[[Any, Any], None]) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        write(writer, store)
+    return path
+
+
+def image_message(store: Any, time_ns: int, image: Array, encoding: str) -> tuple[Any, str]:
+    """An image as ROS has it, its rows padded by 5 bytes."""
+    types = store.types
+    head = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(time_ns, 10**9)), "camera")
+    if encoding in ("png", "jpeg"):
+        data = cv2.imencode(f".{encoding}", image[..., ::-1])[1].ravel()
+        return types["sensor_msgs/msg/CompressedImage"](head, encoding, data), "sensor_msgs/msg/CompressedImage"
+    pixels = {"rgb8": image, "bgr8": image[..., ::-1], "mono8": image[..., :1]}[encoding]
+    rows = np.pad(pixels.reshape(len(pixels), -1), ((0, 0), (0, 5)))
+    height, width = image.shape[:2]
+    message = types["sensor_msgs/msg/Image"](head, height, width, encoding, 0, rows.shape[1], rows.ravel())
+    return message, "sensor_msgs/msg/Image"
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "png"])
+def test_a_bag_is_played(encoding: str, tmp_path: Path) -> None:
+    images = blobs(3, 32, 24)
+
+    def write(writer: Any, store: Any) -> None:
+        kind = image_message(store, 0, images[0], encoding)[1]
+        topic = writer.add_connection("/cam/image", kind, typestore=store)
+        for n, image in enumerate(images):
+            time_ns = 5 * 10**9 + n * 50_000_000
+            message, _ = image_message(store, time_ns, image, encoding)
+            writer.write(topic, time_ns, store.serialize_cdr(message, kind))
+
+    folder = bag(tmp_path / "bag", write)
+    for path in (folder, next(folder.glob("*.mcap"))):
+        camera = open_camera(path, CameraOptions())
+        frames = list(camera.frames())
+        assert camera.size == (32, 24) and [f.timestamp_s for f in frames] == [0.0, 0.05, 0.1]
+        assert frames[-1].arrived_s - frames[0].arrived_s >= 0.099
+        for frame, image in zip(frames, images, strict=True):
+            assert np.array_equal(frame.image, image[..., [0, 0, 0]] if encoding == "mono8" else image)
+
+
+def test_a_bag_says_what_is_in_it(tmp_path: Path) -> None:
+    def write(writer: Any, store: Any) -> None:
+        for topic in ("/left", "/right"):
+            message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
+            writer.write(writer.add_connection(topic, kind, typestore=store), 1, store.serialize_cdr(message, kind))
+
+    folder = bag(tmp_path / "bag", write)
+    with pytest.raises(InputError, match="got 2: /left, /right; say which with --topic"):
+        open_camera(folder, CameraOptions())
+    with pytest.raises(InputError, match="expected one of the image topics /left, /right, got /up"):
+        open_camera(folder, CameraOptions(topic="/up"))
+    assert open_camera(folder, CameraOptions(topic="/right")).size == (64, 48)
+    (tmp_path / "broken.mcap").write_bytes(b"no bag at all")
+    with pytest.raises(InputError, match="expected a ROS bag"):
+        open_camera(tmp_path / "broken.mcap", CameraOptions())
+
+
+def one_image(of: Callable[[bytes], bytes]) -> Callable[[Any, Any], None]:
+    """What writes a bag of one image message, whose bytes were changed."""
+
+    def write(writer: Any, store: Any) -> None:
+        message, kind = image_message(store, 1, blobs(1)[0], "rgb8")
+        topic = writer.add_connection("/a", kind, typestore=store)
+        writer.write(topic, 1, of(bytes(store.serialize_cdr(message, kind))))
+
+    return write
+
+
+@pytest.mark.parametrize(
+    ("of", "says"),
+    [
+        (lambda data: data[:60], "expected a ROS bag, got"),  # a message that is cut
+        (lambda data: data + b"\0" * 8, "expected a ROS bag, got"),  # one that is too long
+        (lambda data: data.replace(b"rgb8", b"abc8"), "expected an image of rgb8"),
+    ],
+)
+def test_a_bag_with_a_damaged_message_is_one_line(of: Callable[[bytes], bytes], says: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=says) as caught:
+        open_camera(bag(tmp_path / "bag", one_image(of)), CameraOptions())
+    assert "\n" not in str(caught.value)
+
+
+def test_a_bag_that_says_it_is_larger_than_memory(tmp_path: Path) -> None:
+    file = next(bag(tmp_path / "bag", one_image(lambda data: data)).glob("*.mcap"))
+    data = bytearray(file.read_bytes())
+    data[9:17] = (2**62).to_bytes(8, "little")  # length of the first record
+    file.write_bytes(data)
+    with pytest.raises(InputError, match="expected a ROS bag, got"):
+        open_camera(file, CameraOptions())
