@@ -26,6 +26,10 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "kitchen_walk, no semantics": ("kitchen_walk", ["--semantics", "none", "--no-map"]),
     "kitchen_walk_close": ("kitchen_walk_close", ["--no-map"]),
     "kitchen_walk_close, no semantics": ("kitchen_walk_close", ["--semantics", "none", "--no-map"]),
+    "kitchen_walk_close, no semantics, causal masks": (
+        "kitchen_walk_close",
+        ["--semantics", "none", "--masks", "causal", "--no-map"],
+    ),
     "lobby": ("lobby", ["--no-map"]),
     "lobby_walk": ("lobby_walk", ["--no-map"]),
     "lobby_walk, no semantics": ("lobby_walk", ["--semantics", "none", "--no-map"]),
