@@ -18,8 +18,8 @@ class DensifySettings:
 
     every: int = 100  # steps between two rounds
     start_ratio: float = 0.05
-    stop_ratio: float = 0.7
-    full_ratio: float = 0.5  # of the schedule: from here on there may be as many Gaussians as the limit
+    stop_ratio: float = 0.8
+    full_ratio: float = 0.35  # of the schedule: from here on there may be as many Gaussians as the limit
     grad_threshold: float = 2e-4  # mean |d loss / d mean| in units of half an image width
     split_sigma_px: float = 3.0  # larger Gaussians are split in two, smaller ones are cloned
     prune_opacity: float = 0.02

@@ -20,7 +20,7 @@ class Effort:
 
 CPU: dict[MapQualityKind, Effort] = {
     "draft": Effort(320, 320 * 240, 800, 25_000, 0),
-    "standard": Effort(1280, 1280 * 375, 3000, 100_000, 0),
+    "standard": Effort(1280, 1280 * 375, 3600, 100_000, 0),
     "high": Effort(1280, 1280 * 720, 10_000, 300_000, 1),
 }
 ACCELERATOR: dict[MapQualityKind, Effort] = {
