@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -112,3 +113,14 @@ def test_a_bag_that_says_it_is_larger_than_memory(tmp_path: Path) -> None:
     file.write_bytes(data)
     with pytest.raises(InputError, match="expected a ROS bag, got"):
         open_camera(file, CameraOptions())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes there")
+def test_a_bag_with_a_pipe_in_it_is_not_waited_for(tmp_path: Path) -> None:
+    folder = bag(tmp_path / "bag", one_image(lambda data: data))
+    file = next(folder.glob("*.mcap"))
+    file.unlink()
+    os.mkfifo(file)
+    for path in (folder, file):
+        with pytest.raises(InputError, match=r"expected .*got a named pipe|expected a file or a folder"):
+            open_camera(path, CameraOptions())

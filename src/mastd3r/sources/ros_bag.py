@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError, MissingPackage
-from ..reading.files import is_file, short
+from ..reading.files import check_plain, entries_of, is_dir, is_file, short
 from ..reading.pictures import check_pixels, decoded
 from .camera import CameraFrame, CameraOptions
 from .lost import changed
@@ -56,6 +56,8 @@ class RosBag:
             import rosbags.highlevel  # noqa: F401
         except ImportError as e:
             raise MissingPackage(PACKAGE) from e
+        for part in entries_of(path) if is_dir(path) else [path]:
+            check_plain(part, "files of a ROS bag")  # a pipe among them would be waited for
         self.name, self._path, self._fps = path.stem, path, options.pace_fps
         self.said: list[str] = []
         self._topic: str | None = None
