@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mastd3r.errors import InputError, OutputError
 from mastd3r.export.export_folder import export_folder
-from mastd3r.export.files import write_text
+from mastd3r.export.files import write_json, write_text
 from mastd3r.export.point_cloud import read_cloud, write_cloud
 from mastd3r.export.report_files import run_files
 from mastd3r.export.trajectory_files import read_tum, write_tum
@@ -26,6 +27,15 @@ def test_what_has_no_name_of_its_own_is_refused(out: str, tmp_path: Path, monkey
     with pytest.raises(OutputError, match="expected a folder with a name of its own"), export_folder(Path(out), {}, []):
         pass
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_or_a_device_is_no_place_for_a_file(tmp_path: Path) -> None:
+    pipe = tmp_path / "metrics.json"
+    os.mkfifo(pipe)
+    with pytest.raises(OutputError, match="a device or a pipe"):
+        write_json(pipe, {"ate": 1.0})
+    assert pipe.is_fifo() and list(tmp_path.iterdir()) == [pipe]
 
 
 def test_the_list_of_files_leaves_out_what_cannot_be_looked_at(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -44,10 +45,13 @@ def write_bytes(path: Path, data: bytes) -> None:
 def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
     """A temporary beside ``path`` for the body to write; it takes the place of ``path`` only once the body is done.
 
-    ``suffix``: what its name must end with, where a writer goes by that. Raises OutputError.
+    ``suffix``: what its name must end with, where a writer goes by that. Raises OutputError, also for a device or a
+    pipe, which would be gone.
     """
     if path.name in ("", ".."):
         raise OutputError(f"{path}: expected a file with a name of its own to write, got a folder")
+    if _is_device(path):
+        raise OutputError(f"{path}: expected to write a file of its own, got a device or a pipe of that name")
     temporary = path.with_name(f"{path.name}.part{suffix}")
     with writing(path):
         try:
@@ -57,6 +61,14 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
             with suppress(OSError):
                 temporary.unlink()
             raise
+
+
+def _is_device(path: Path) -> bool:
+    """True where a device, a pipe or a socket has that name."""
+    with suppress(OSError, ValueError):
+        mode = os.stat(path).st_mode
+        return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
+    return False
 
 
 def write_text(path: Path, text: str) -> None:
