@@ -25,7 +25,6 @@ from .views import Neighbourhood, StereoView, neighbourhoods
 
 Array = NDArray[Any]
 SOURCES = 6  # views that a view is compared with
-POINTS_A_VIEW = 100  # known points that say which, on average
 SWEPT_WIDTH_PX = 320  # about the width of the images that are swept: smaller by a whole number
 TOLERANCE = 0.015  # relative difference of depth up to which two views agree
 REACH_PX = 1.5  # and so near to where it came from a pixel must come back
@@ -63,8 +62,7 @@ class DepthMaps:
 
 def dense_depth(views: list[StereoView], points_world: Array, advance: Callable[[], None]) -> DepthMaps:
     """Depth maps of views of one camera, whose common points (n, 3) are known; ``advance`` is called for every view."""
-    some = points_world[:: max(1, len(points_world) // (POINTS_A_VIEW * len(views)))]
-    near = neighbourhoods(views, some, SOURCES)
+    near = neighbourhoods(views, points_world, SOURCES)
     shrink = max(1, round(views[0].camera.width / SWEPT_WIDTH_PX))
     images = [sweep_image(view, shrink) for view in views]
 
