@@ -3,7 +3,8 @@
 usage: python benchmarks/dense.py --run RUN --sequence SEQUENCE --out dense.json [--work DIR]
 The run is one of ``mastd3r run SEQUENCE``. Depth is found anew from its keyframes; the sensor's depth is for the
 judgement alone. Printed and written: seconds, coverage, and the figures of ``mastd3r eval`` for cloud and mesh, the
-splat's own depth in place of the swept one where there is a splat, and what the sensor reads against the true poses.
+splat's own depth in place of the swept one where there is a splat, what the sensor reads against the true poses, and
+how well the sensor's own depth, as points and as a mesh, does as the estimate.
 """
 
 from __future__ import annotations
@@ -30,12 +31,13 @@ from mastd3r.export.read_run import Run, read_run
 from mastd3r.geometry.se3 import inverse
 from mastd3r.mapping.ply import read_gaussians_ply
 from mastd3r.mapping.splat import NEAR_RATIO, Splat
-from mastd3r.mvs.depth_maps import REACH_PX, DepthMaps, agreed
+from mastd3r.mvs.depth_maps import REACH_PX, SOURCES, DepthMaps, agreed
 from mastd3r.mvs.mesh import Mesh, meshed
 from mastd3r.mvs.views import StereoView
 from mastd3r.offline.dense import densified, write_dense
 from mastd3r.progress import Silent
 from mastd3r.sources import open_source
+from mastd3r.types import Frame, State, Trajectory, Truth
 
 Array = NDArray[Any]
 SCALES = np.arange(0.9, 1.2001, 0.02)  # of the sensor's depth, that are tried
@@ -76,19 +78,20 @@ def measured(run: Run, sequence: Path, work: Path) -> dict[str, Any]:
     dense = densified(run, source, Silent())
     points = write_dense(dense, work / "cloud_dense.ply")
     cloud_s, cloud_cpu_s = time.perf_counter() - began, time.process_time() - cpu
-    began = time.perf_counter()
+    cpu, began = time.process_time(), time.perf_counter()
     mesh = meshed(dense.views, dense.maps)
-    mesh_s = time.perf_counter() - began
+    mesh_s, mesh_cpu_s = time.perf_counter() - began, time.process_time() - cpu
     write_mesh(work / "mesh.ply", mesh.vertices_world, mesh.faces, mesh.colors)
     write_mesh(work / "mesh.glb", mesh.vertices_world, mesh.faces, mesh.colors)
     found = {
         "date": datetime.now(UTC).date().isoformat(),
         "machine": machine_info(),
         "sensor_scale": sensor_scale(sensor_views(truth, frames), truth.focal_px, lens),
+        **sensor_itself(sensor_views(truth, frames), truth, frames, lens),
         "sparse": scored(read_cloud(run.path / "cloud.ply").points_world),
         "dense": {**dense.facts, "points": points, "seconds": cloud_s, "cpu_s": cloud_cpu_s}
         | scored(read_points(work / "cloud_dense.ply")),
-        "mesh": {"triangles": len(mesh.faces), "seconds": mesh_s} | scored(on_surface(mesh)),
+        "mesh": {"triangles": len(mesh.faces), "seconds": mesh_s, "cpu_s": mesh_cpu_s} | scored(on_surface(mesh)),
     }
     if (run.path / "gaussians.ply").is_file():
         other = meshed(dense.views, splat_maps(run, dense.views, dense.maps))
@@ -122,6 +125,36 @@ def sensor_scale(sensor: list[SensorView], focal_px: float | None, lens: Camera)
     differences = [difference(scale) for scale in SCALES]
     best = int(np.argmin(differences))
     return {"scale": float(SCALES[best]), "difference_m": differences[best], "difference_at_1_m": difference(1.0)}
+
+
+def sensor_itself(sensor: list[SensorView], truth: Truth, frames: list[Frame], lens: Camera) -> dict[str, Any]:
+    """Figures of the sensor's own depth at the true poses: what no estimate can beat by much.
+
+    As points, of frames that are not judged against; and as one surface, of those that are, by the mesh of this
+    package, also with depth divided by what ``sensor_scale`` finds.
+    """
+    camera = lens.pinhole if truth.focal_px is None else Camera.centred(truth.focal_px, lens.width, lens.height)
+    states: tuple[State, ...] = ("tracked",) * len(truth.timestamps_s)
+    exact = Trajectory(truth.timestamps_s, truth.world_from_cam, states, np.ones(len(states), bool))
+    others = sensor_views(truth, [replace(f, index=f.index - 2) for f in frames])
+    rays = camera.rays(camera.pixel_grid())
+    clouds = [
+        (rays * view.depth_m[..., None])[view.depth_m > 0][::4] @ view.world_from_cam[:3, :3].T
+        + view.world_from_cam[:3, 3]
+        for view in others
+    ]
+    found = {"sensor's other frames": evaluate_cloud(np.concatenate(clouds), exact, truth, frames, lens)}
+    poses = np.stack([view.world_from_cam for view in sensor])
+    depth = np.stack([view.depth_m for view in sensor])
+    blank = np.zeros((*depth.shape[1:], 3), np.uint8)
+    views = [StereoView(0.0, blank, np.ones(blank.shape[:2], bool), pose, camera) for pose in poses]
+    for scale in (1.0, sensor_scale(sensor, truth.focal_px, lens)["scale"]):
+        rho = np.where(depth > 0, scale / np.maximum(depth, 1e-9), 0).astype(np.float32)
+        seen = np.full(rho.shape, SOURCES, np.uint8)
+        mesh = meshed(views, DepthMaps(rho, seen, rho, rho > 0, camera, poses, ()))
+        name = "mesh of the sensor's depth" + ("" if scale == 1 else ", divided")
+        found[name] = evaluate_cloud(on_surface(mesh), exact, truth, frames, lens)
+    return found
 
 
 def on_surface(mesh: Mesh) -> Array:

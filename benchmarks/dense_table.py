@@ -17,7 +17,8 @@ COLUMNS = (
     "within 5 cm", "F-score at 5 cm",
 )  # fmt: skip
 SPLAT = "mesh of the splat's depth"
-ROWS = {"sparse": "`cloud.ply`", "dense": "`cloud_dense.ply`", "mesh": "mesh", SPLAT: SPLAT}
+SENSOR = ("sensor's other frames", "mesh of the sensor's depth", "mesh of the sensor's depth, divided")
+ROWS = {"sparse": "`cloud.ply`", "dense": "`cloud_dense.ply`", "mesh": "mesh", SPLAT: SPLAT, **{n: n for n in SENSOR}}
 
 
 def dense(path: Path) -> list[str]:
@@ -40,11 +41,14 @@ def dense(path: Path) -> list[str]:
         "",
         f"The dense cloud has {cloud['points']:,} points, on {cloud['covered_ratio']:.0%} of the static pixels of "
         f"{cloud['keyframes']} views; {cloud['seconds']:.0f} s beside other work, {cloud['cpu_s']:.0f} s of processor "
-        f"time. The mesh has {mesh['triangles']:,} triangles, {mesh['seconds']:.0f} s more.",
+        f"time. The mesh has {mesh['triangles']:,} triangles, {mesh['seconds']:.0f} s more, {mesh['cpu_s']:.0f} s of "
+        "processor time.",
         "The sensor's depth images agree best with one another under the true poses when they are divided by "
         f"{sensor['scale']:.2f} (mean difference {1000 * sensor['difference_m']:.1f} mm, "
         f"{1000 * sensor['difference_at_1_m']:.1f} mm undivided): no cloud can be right in both, and the ICP finds a "
         f"scale of {cloud['cloud_registered_scale']:.3f}.",
+        "The last rows are the sensor's own depth at the true poses in place of the estimate: one surface cannot be "
+        "complete against depth images that lie beside one another.",
     ]
     return lines
 

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from .depth_maps import TOLERANCE, DepthMaps, pinhole, relative
 from .fusion_kernels import mark_shown
 from .views import StereoView
+from .voxels import surest_of_voxels
 
 Array = NDArray[Any]
 SPACING_PX = 2.0  # one point a voxel of so many pixels at the median depth
+FILLED_CONFIDENCE = 0.5  # of a point filled from a plane or from around, to one that was matched
 NORMAL_SMOOTHING_PX = 5  # window over which inverse depth is smoothed before its slope is taken
 
 
@@ -25,7 +27,7 @@ class DenseCloud:
     points_world: Array  # (n, 3) float32
     normals: Array  # (n, 3) float32, unit, towards the camera that saw it
     colors: Array  # (n, 3) uint8 RGB
-    confidence: Array  # (n,) float32 0..1: the share of the views compared that see the point there
+    confidence: Array  # (n,) float32 0..1: share of the views compared that see the point there, half of it if filled
 
 
 def fused(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
@@ -41,7 +43,9 @@ def fused(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
         mark_shown(maps.inv_depth, i, others, pinhole(maps.camera), from_ref, TOLERANCE, keep, taken)
         pose = maps.world_from_cam[i]
         points = (rays[keep] / maps.merged[i][keep][:, None]) @ pose[:3, :3].T + pose[:3, 3]
-        confidence = maps.agreeing[i][keep] / max(1, len(others))
+        confidence = (
+            maps.agreeing[i][keep] / max(1, len(others)) * np.where(maps.measured[i][keep], 1, FILLED_CONFIDENCE)
+        )
         rows = surest_of_voxels(points, confidence, spacing)  # of the view first: sorting all at once takes long
         normals = normals_cam(maps.merged[i], rays)[keep][rows] @ pose[:3, :3].T
         parts.append((points[rows], normals, view.color[keep][rows], confidence[rows]))
@@ -49,15 +53,6 @@ def fused(views: list[StereoView], maps: DepthMaps) -> DenseCloud:
     rows = surest_of_voxels(points, confidence, spacing)
     points, normals, colors, confidence = points[rows], normals[rows], colors[rows], confidence[rows]
     return DenseCloud(points.astype(np.float32), normals.astype(np.float32), colors, confidence.astype(np.float32))
-
-
-def surest_of_voxels(points: Array, confidence: Array, spacing: float) -> Array:
-    """Ascending rows of the surest of the points (n, 3) in every voxel ``spacing`` wide, the first of equals."""
-    cell = np.floor(points / spacing).astype(np.int64)
-    order = np.lexsort((-confidence, *cell.T))
-    fresh = np.ones(len(order), bool)
-    fresh[1:] = (np.diff(cell[order], axis=0) != 0).any(1)
-    return np.sort(order[fresh])
 
 
 def normals_cam(inv_depth: Array, rays: Array) -> Array:

@@ -19,13 +19,14 @@ from .views import StereoView
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
-VOXELS_A_DEPTH = 110  # of the median depth
-TRUNCATION_VOXELS = 5.0
+VOXELS_A_DEPTH = 150  # of the median depth
+TRUNCATION_VOXELS = 3.0
+FREE_WEIGHT = 0.1  # of a view that sees a voxel well before its surface, so that one that is wrong carves little
 FAR_RATIO = 5.0  # depth beyond so many median depths is left out
 MAX_BLOCKS = 80_000  # of 512 voxels; where more would be needed, voxels are made twice as wide
 AGREEING = 2  # other views that must agree; one less than for the cloud, as the volume takes means
 LEAST_WEIGHT = 1.0  # agreeing views, summed over the views that see a voxel
-SMALLEST_FACES = 200  # pieces of fewer triangles are left out
+SMALLEST_FACES = 60  # pieces of fewer triangles are left out
 COLOR_TOLERANCE = 0.03  # relative depth up to which a view sees a vertex
 
 
@@ -55,8 +56,8 @@ def meshed(views: list[StereoView], maps: DepthMaps) -> Mesh:
     value, weight = np.empty(shape, np.float32), np.empty(shape, np.float32)
     k = pinhole(maps.camera)
     in_blocks(
-        integrate, len(blocks), blocks, voxel, TRUNCATION_VOXELS * voxel, inv_depth, maps.agreeing, k, cam_from_world,
-        value, weight,
+        integrate, len(blocks), blocks, voxel, TRUNCATION_VOXELS * voxel, FREE_WEIGHT, inv_depth, maps.agreeing, k,
+        cam_from_world, value, weight,
     )  # fmt: skip
     vertices, faces = _without_crumbs(*surface_net(blocks, value, weight, LEAST_WEIGHT))
     points = (vertices * voxel).astype(np.float32)
@@ -123,7 +124,7 @@ def _around(blocks: Array) -> Array:
 
 
 def _without_crumbs(vertices: Array, faces: Array) -> tuple[Array, Array]:
-    """Without connected pieces of fewer than 200 triangles, and without vertices that no triangle has."""
+    """Without connected pieces of fewer than 60 triangles, and without vertices that no triangle has."""
     if not len(faces):
         return vertices[:0], faces
     ends = np.concatenate([faces[:, :2], faces[:, 1:]])

@@ -60,22 +60,22 @@ def plane_inv_depths(ref: SweepImage, sources: list[SweepImage], inv_depth_range
     return np.linspace(far, near, count)
 
 
-def cost_volume(ref: SweepImage, sources: list[SweepImage], inv_depths: Array) -> Array:
-    """(h, w, D) float32 matching cost in 0..1 of every pixel on every plane."""
+def cost_volume(ref: SweepImage, sources: list[SweepImage], slopes: Array) -> Array:
+    """(h, w, D) float32 matching cost in 0..1 of every pixel on planes whose inverse depth is slope (D, 3) . ray."""
     h, w = ref.gray.shape
     window = (WINDOW_PX, WINDOW_PX)
     ref_mean = cv2.blur(ref.gray, window)
     ref_var = np.maximum(cv2.blur(ref.gray * ref.gray, window) - ref_mean**2, 0)
     sums = np.empty((len(sources), 3, h, w), np.float32)
     valid = np.empty((len(sources), h, w), np.uint8)
-    out = np.empty((h, w, len(inv_depths)), np.float32)
+    out = np.empty((h, w, len(slopes)), np.float32)
     plane = np.empty((h, w), np.float32)
     ref_from_px = np.linalg.inv(ref.matrix)
     relative = [inverse(s.world_from_cam) @ ref.world_from_cam for s in sources]
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    for d, rho in enumerate(inv_depths):
+    for d, slope in enumerate(slopes):
         for s, (source, from_ref) in enumerate(zip(sources, relative, strict=True)):
-            px_from_px = source.matrix @ (from_ref[:3, :3] + rho * np.outer(from_ref[:3, 3], [0, 0, 1])) @ ref_from_px
+            px_from_px = source.matrix @ (from_ref[:3, :3] + np.outer(from_ref[:3, 3], slope)) @ ref_from_px
             warped = cv2.warpPerspective(source.gray, px_from_px, (w, h), flags=flags)
             valid[s] = cv2.warpPerspective(
                 source.static, px_from_px, (w, h), flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
@@ -91,10 +91,10 @@ def cost_volume(ref: SweepImage, sources: list[SweepImage], inv_depths: Array) -
 def swept_inv_depth(ref: SweepImage, sources: list[SweepImage], near: Neighbourhood) -> tuple[Array, Array]:
     """(h, w) float32 inverse depth of every pixel, and (h, w) float32 matching cost there, 0..1."""
     inv_depths = plane_inv_depths(ref, sources, near.inv_depth_range)
-    cost = cost_volume(ref, sources, inv_depths)
+    cost = cost_volume(ref, sources, inv_depths[:, None] * np.array([0, 0, 1.0]))
     total = np.zeros_like(cost)
     for backward in (False, True):
-        aggregate(cost, ref.gray, P1, P2, EDGE_LEVELS, backward, total)
+        aggregate(cost, ref.gray, P1, P2, P1, EDGE_LEVELS, backward, total)
     place = np.empty(ref.gray.shape, np.float32)
     best_plane(total, place)
     step = (inv_depths[-1] - inv_depths[0]) / (len(inv_depths) - 1)

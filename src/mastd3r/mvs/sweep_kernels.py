@@ -70,10 +70,13 @@ def _step(cost: Array, before: Array, low: float, p1: float, p2: float, now: Arr
 
 
 @nb.njit(**_JIT)
-def aggregate(cost: Array, gray: Array, p1: float, p2: float, edge: float, backward: bool, total: Array) -> None:
+def aggregate(
+    cost: Array, gray: Array, p1: float, p2: float, least: float, edge: float, backward: bool, total: Array
+) -> None:
     """Adds four paths of semi-global matching to ``total`` (h, w, D): those that come from before in reading order,
     or, ``backward``, from after. cost: (h, w, D) float32. gray: (h, w) float32. A jump costs p2 / (1 + |step| / edge),
-    never less than p1, where the grey level steps so much along the path."""
+    never less than ``least``, where the grey level steps so much along the path. p1 is inf where planes have no order.
+    """
     h, w, count = cost.shape
     rows = np.zeros((3, 2, w, count), np.float32)  # of the three paths from the row before
     lows = np.zeros((3, 2, w), np.float32)
@@ -91,7 +94,7 @@ def aggregate(cost: Array, gray: Array, p1: float, p2: float, edge: float, backw
                 low = np.float32(0)
                 jump = p2
             else:
-                jump = max(p1, p2 / (1 + abs(gray[y, x] - gray[y, x - sign]) / edge))
+                jump = max(least, p2 / (1 + abs(gray[y, x] - gray[y, x - sign]) / edge))
             low = _step(cost[y, x], along[there], low, p1, jump, along[here], total[y, x])
             for path in range(3):
                 at = x - sign * (1 - path)
@@ -99,12 +102,12 @@ def aggregate(cost: Array, gray: Array, p1: float, p2: float, edge: float, backw
                     for d in range(count):
                         rows[path, new, x, d] = cost[y, x, d]
                         total[y, x, d] += cost[y, x, d]
-                    least = np.float32(1e9)
+                    start = np.float32(1e9)
                     for d in range(count):
-                        least = min(least, cost[y, x, d])
-                    lows[path, new, x] = least
+                        start = min(start, cost[y, x, d])
+                    lows[path, new, x] = start
                 else:
-                    jump = max(p1, p2 / (1 + abs(gray[y, x] - gray[y - sign, at]) / edge))
+                    jump = max(least, p2 / (1 + abs(gray[y, x] - gray[y - sign, at]) / edge))
                     lows[path, new, x] = _step(
                         cost[y, x],
                         rows[path, old, at],

@@ -25,6 +25,7 @@ def integrate(
     blocks: Array,
     voxel: float,
     truncation: float,
+    free: float,
     maps: Array,
     weights: Array,
     k: Array,
@@ -35,6 +36,7 @@ def integrate(
     """Sums of all views into blocks first … last-1 (Curless and Levoy, SIGGRAPH 1996).
 
     blocks: (n, 3) int64, in blocks from the origin. maps: (V, h, w) inverse depth, 0 = none; weights: (V, h, w) uint8.
+    ``free``: what a view counts, of its weight, that sees a voxel more than a truncation before its surface.
     k: (4,) fx fy cx cy. cam_from_world: (V, 3, 4). value and weight: (n, 8, 8, 8) float32, written.
     """
     views, h, w = maps.shape
@@ -58,6 +60,8 @@ def integrate(
                         if distance < -1:
                             continue
                         own = float(weights[n, row, column])
+                        if distance > 1:
+                            own *= free
                         total += own * min(distance, 1.0)
                         by += own
                     weight[b, i, j, l] = by
