@@ -105,7 +105,7 @@ class KeyframeGraph:
     def depth_info(self, kf_id: int) -> Array:
         """(p,) information of a keyframe's inverse depths, prior included."""
         v = self.variables[kf_id]
-        return v.prior_info if len(v.depth_info) == 0 else v.depth_info + v.prior_info
+        return v.depth_info + v.prior_info if len(v.depth_info) else v.prior_info
 
     def median_inv_depth(self, kf_id: int) -> float:
         """Median over the points that have been seen from elsewhere."""
@@ -206,19 +206,19 @@ class KeyframeGraph:
         """What comes next is not connected to what is there, until it is recognised."""
         self.submap = 1 + max(self.submap_of.values(), default=-1)
 
-    def drop_submap(self) -> None:
-        """Forget the keyframes of the submap being tracked, the newest; its frames become lost."""
-        gone = set(self.members())
-        self.keyframes = [kf for kf in self.keyframes if kf.id not in gone]
-        assert all(n == kf.id for n, kf in enumerate(self.keyframes))
-        self.edges = [e for e in self.edges if e.i not in gone and e.j not in gone]
-        for k in gone:
-            del self.variables[k], self.submap_of[k]
+    def drop_submap(self, submap: int | None = None) -> None:
+        """Forget the keyframes of a submap, by default of the one being tracked; its frames become lost."""
+        gone = set(self.members(submap))
+        new = {k: n for n, k in enumerate(kf.id for kf in self.keyframes if kf.id not in gone)}
+        self.keyframes = [replace(kf, id=new[kf.id]) for kf in self.keyframes if kf.id in new]
+        self.edges = [replace(e, i=new[e.i], j=new[e.j]) for e in self.edges if e.i in new and e.j in new]
+        self.variables = {new[k]: v for k, v in self.variables.items() if k in new}
+        self.submap_of = {new[k]: s for k, s in self.submap_of.items() if k in new}
         for r in self.records:
             if r.kf_id in gone:
-                r.state, r.is_keyframe, r.kf_id = "lost", False, max(len(self.keyframes) - 1, 0)
-                r.points, r.target, r.weight = no_matches()
-        self.started.discard(self.submap)
+                r.state, r.is_keyframe, (r.points, r.target, r.weight) = "lost", False, no_matches()
+            r.kf_id = new.get(r.kf_id, max(sum(k < r.kf_id for k in new) - 1, 0))
+        self.started.discard(self.submap if submap is None else submap)
 
     def part(self) -> KeyframeGraph:
         """The submap being tracked as a graph by itself, sharing keyframes, variables, edges and records."""
@@ -342,7 +342,7 @@ class KeyframeGraph:
     def discount_points(self, kf_id: int, static: Array) -> None:
         """Later evidence on a keyframe's points, (p,) P(static): it lowers what they and their surroundings count.
 
-        The frames that hang on the keyframe keep matches of these points, which count for less as well.
+        The matches of these points that frames keep count for less as well.
         """
         kf = self.keyframes[kf_id]
         np.minimum(kf.static, static, out=kf.static)

@@ -15,6 +15,7 @@ from .places import candidates
 from .two_view import TwoView, TwoViewEstimator
 
 log = logging.getLogger(__name__)
+LEAST_UNSCALED = 2  # views beyond doubt, for a submap to be given up
 MATCHED_AROUND = 2  # keyframes on either side of the recognised one that are matched as well
 
 
@@ -25,13 +26,18 @@ def join_recognised(
     edges: CovisibilityEdges,
     places: PlaceRecognition,
     entry: MapEntry,
+    unscaled: list[TwoView],
 ) -> bool:
-    """Recognise a place of another submap in ``kf``; the two become one. The other submap's world is kept."""
+    """Recognise a place of another submap in ``kf``; the two become one. The other submap's world is kept.
+
+    ``unscaled`` takes the views of such places whose scale is not known: too few points have a depth on both sides.
+    """
     own = graph.submap_of[kf.id]
     for view in _seen_elsewhere(graph, kf, two_view, places, entry):
         other, pose = view.anchor, view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
         if kf_from_other is None:
+            unscaled.append(view)
             continue
         scale = 1 / kf_from_other.scale
         log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
@@ -43,6 +49,20 @@ def join_recognised(
         graph.solve_all(10, 2.0)
         return True
     return False
+
+
+def give_up_unscaled(graph: KeyframeGraph, submap: int, unscaled: list[TwoView]) -> bool:
+    """Drop a submap that could not be joined though larger ones see it: its frames are looked for in those.
+
+    A piece whose scale is not known has depths of no use, and would be placed by continuity alone.
+    """
+    count = len(graph.members(submap))
+    larger = [v for v in unscaled if len(graph.members(graph.submap_of[v.anchor.id])) > count]
+    if len(larger) < LEAST_UNSCALED:
+        return False
+    log.info("submap %d of %d keyframes is seen by others, but has no scale: its frames are lost", submap, count)
+    graph.drop_submap(submap)
+    return True
 
 
 def _seen_elsewhere(

@@ -21,7 +21,7 @@ from ..pointmap.flow_maps import invert_flow
 from ..types import WorkFrame
 from .covisibility import CovisibilityEdges
 from .depth_prior import own_depth_prior, predicted_depth
-from .joining import join_recognised
+from .joining import give_up_unscaled, join_recognised
 from .map_entry import MAP, MapEntry
 from .observation import Observation
 from .state import TrackedFrame, TrackingState, status_in
@@ -218,7 +218,10 @@ class Keyframes:
 
     def joins(self, kf: Keyframe) -> bool:
         """True where ``kf`` shows a place of another submap, and the two have become one."""
-        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places, self.entry)
+        return self._joins(kf, [])
+
+    def _joins(self, kf: Keyframe, unscaled: list[TwoView]) -> bool:
+        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places, self.entry, unscaled)
 
     # -- after the last frame --------------------------------------------------------------------------------
 
@@ -239,10 +242,17 @@ class Keyframes:
         if elsewhere and graph.keyframes and not graph.initialised and not bootstrap(graph):
             graph.drop_submap()
             graph.submap = graph.submap_of[graph.latest.id]
-        for submap in sorted(graph.started)[1:]:
-            graph.submap = submap
-            any(self.joins(graph.keyframes[k]) for k in graph.members())
+        self._join_all()
         graph.leave_map_unless_found()
+
+    def _join_all(self) -> None:
+        graph = self.graph
+        for submap in sorted(graph.started)[1:]:
+            graph.submap, unscaled = submap, list[TwoView]()
+            joined = any(self._joins(graph.keyframes[k], unscaled) for k in graph.members())
+            if not joined and give_up_unscaled(graph, submap, unscaled):
+                graph.submap = graph.submap_of[graph.latest.id]
+                self.edges.flows = {}  # by numbers that keyframes had
 
     def close(self) -> None:
         """End the thread."""
