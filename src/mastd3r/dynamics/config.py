@@ -10,6 +10,8 @@ from typing import Annotated
 
 from ..registry import DYNAMICS, NotNegative, OneOrMore, Positive, Range, Share
 
+NEVER_SATURATED = 1e3  # log-odds far beyond all that there are
+
 VariantKind = Annotated[str, DYNAMICS]
 
 
@@ -153,10 +155,15 @@ class DynamicsConfig:
     def while_tracking(self) -> DynamicsConfig:
         """A pose needs every static point that there is: a semantic map is believed where it shows nothing.
 
-        And it needs what moves kept out: at a fast turn, too, what finds no match is held to move.
+        So outlines are tight: evidence is pooled as it is. And it needs what moves kept out: at a fast turn, too, what
+        finds no match is held to move.
         """
         semantic = replace(self.semantic, missed=self.semantic.floor)
-        return replace(self, semantic=semantic, motion=replace(self.motion, doubts_unmatched=False))
+        motion, refinement = (
+            replace(self.motion, doubts_unmatched=False),
+            replace(self.refinement, saturation=NEVER_SATURATED),
+        )
+        return replace(self, semantic=semantic, motion=motion, refinement=refinement)
 
 
 OLD_NAMES = {  # of one version ago -> section.name now
