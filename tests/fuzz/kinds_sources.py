@@ -192,7 +192,7 @@ def lists_and_truth(rng: random.Random, room: Room, shared: Shared) -> Case:
         "semantic.txt",
         "info.json",
     )
-    for name in rng.sample(names, rng.choice((1, 1, 2))):
+    for name in dict.fromkeys(rng.sample(names, rng.choice((1, 1, 2)))):  # what is spoilt once may be no text any more
         path = folder / name
         text = path.read_text()
         if rng.random() < 0.8:
