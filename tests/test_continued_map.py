@@ -27,7 +27,7 @@ from mastd3r.export.run_folder import RunFolder, stamp
 from mastd3r.mapping.gaussian_arrays import of_degree
 from mastd3r.mapping.ply import read_gaussians_ply
 from mastd3r.mapping.quality import CPU
-from mastd3r.offline import continued_map, job, map_progress, map_stage
+from mastd3r.offline import continued_map, map_progress, map_stage
 from mastd3r.progress import Bar
 from mastd3r.sources import open_source
 from mastd3r.types import View
@@ -49,13 +49,15 @@ def ended(room_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """The clip with a small map; its poses are those that it was trained with."""
     out, views = tmp_path_factory.mktemp("continued") / "run", []
 
+    train_map = map_stage.train_map
+
     def watched(*given: Any) -> map_stage.TrainedMap:
         views.extend(given[3])
-        return map_stage.train_map(*given)
+        return train_map(*given)
 
     sets = (f"mapping.iterations={STEPS}", "mapping.width_px=120")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(job, "train_map", watched)
+        patch.setattr(map_stage, "train_map", watched)
         words = ["run", str(room_clip), "--out", str(out), "--quiet", *DEPTH]
         assert main([*words, *(w for s in sets for w in ("--set", s))]) == 0
     return Ended(out, views)

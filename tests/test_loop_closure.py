@@ -387,5 +387,5 @@ def test_pieces_are_not_joined_by_a_view_in_doubt(scene: Any) -> None:
     eyes: Any = SimpleNamespace(parts=parts, relocalised=lambda *_: SimpleNamespace(), beyond_doubt=doubted)
     places: Any = SimpleNamespace(best=lambda graph, work, ids: [graph.keyframes[ids[0]]])
     entry: Any = SimpleNamespace(view=lambda *_: None, open_to=lambda ids: ids)
-    assert not join_recognised(graph, graph.latest, eyes, None, places, entry)  # type: ignore[arg-type]
+    assert not join_recognised(graph, graph.latest, eyes, None, places, entry, [])  # type: ignore[arg-type]
     assert asked == [VIEWS - 1] and graph.submap_of[VIEWS - 1] == 1
