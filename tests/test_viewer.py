@@ -371,3 +371,8 @@ def test_ctrl_c_ends_it_cleanly(run: Path) -> None:
     assert process.returncode == 130 and rest == ""
     assert said.splitlines()[-1] == "mastd3r: stopped; the run is as it was"
     assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("host", ["x\x9by", "a" * 70, "..", "\ud800"])
+def test_a_name_that_no_host_can_have_is_refused(host: str) -> None:
+    assert refused(host, FIRST_PORT) == "a name that no host can have"

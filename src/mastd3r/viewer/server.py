@@ -76,6 +76,8 @@ def refused(host: str, port: int) -> str | None:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(where)
             probe.listen(1)
+    except UnicodeError:
+        return "a name that no host can have"
     except (OSError, OverflowError) as e:
         return str(getattr(e, "strerror", None) or e).lower()
     return None
