@@ -65,8 +65,7 @@ def test_the_first_frame_is_known_by_those_after_it() -> None:
 
 def test_an_empty_room_stays_static() -> None:
     frames = [input_of(i, *frame(i, 1e6)[:2]) for i in range(8)]
-    called = [m.moving.mean() for m in smoothed(frames)]
-    assert max(called) < 0.01 and np.mean(called) < 0.001
+    assert max(m.moving.mean() for m in smoothed(frames)) < 0.005
 
 
 def test_nothing_is_said_to_move_against_a_pose_that_is_a_guess() -> None:

@@ -10,8 +10,6 @@ from typing import Annotated
 
 from ..registry import DYNAMICS, NotNegative, OneOrMore, Positive, Range, Share
 
-NEVER_SATURATED = 1e3  # log-odds far beyond all that there are
-
 VariantKind = Annotated[str, DYNAMICS]
 
 
@@ -104,7 +102,6 @@ class RefinementConfig:
     """Edge-aware refinement: log-odds as whole objects at full size."""
 
     enabled: bool = True  # False: the half-size log-odds are only enlarged
-    saturation: Positive = 4.0  # log-odds from which evidence is hardly surer when it is pooled, where there is no map
     region_px: Positive = 20.0  # reach of the pooling where there is no edge
     region_contrast: Positive = 15.0  # grey levels that are as far as region_px
     semantic_contrast: NotNegative = 60.0  # grey levels that a step of the semantic map from 0 to 1 is worth
@@ -155,15 +152,10 @@ class DynamicsConfig:
     def while_tracking(self) -> DynamicsConfig:
         """A pose needs every static point that there is: a semantic map is believed where it shows nothing.
 
-        So outlines are tight: evidence is pooled as it is. And it needs what moves kept out: at a fast turn, too, what
-        finds no match is held to move.
+        And it needs what moves kept out: at a fast turn, too, what finds no match is held to move.
         """
         semantic = replace(self.semantic, missed=self.semantic.floor)
-        motion, refinement = (
-            replace(self.motion, doubts_unmatched=False),
-            replace(self.refinement, saturation=NEVER_SATURATED),
-        )
-        return replace(self, semantic=semantic, motion=motion, refinement=refinement)
+        return replace(self, semantic=semantic, motion=replace(self.motion, doubts_unmatched=False))
 
 
 OLD_NAMES = {  # of one version ago -> section.name now

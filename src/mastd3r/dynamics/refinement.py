@@ -14,7 +14,6 @@ from .regions import Layer, guided_coefficients, region_mean
 
 Array = NDArray[Any]
 USUAL_SIZE = 512 * 384  # working pixels that the guided filter's radius is said for
-MOST_SURE = 0.999  # of what is pooled, where it becomes log-odds again
 
 
 class EdgeRefinement:
@@ -52,40 +51,20 @@ class EdgeRefinement:
         """
         if not self.config.refinement.enabled:
             return self.full(log_odds)
-        c, limit = self.config.refinement, self.config.max_log_odds
-        semantic = frame.semantic if self.config.semantic.enabled else None
+        c, semantic, limit = self.config.refinement, frame.semantic, self.config.max_log_odds
         guide = self.shrink(frame.gray).astype(np.float32)
         edges: list[Layer] = [(guide, 1.0), *_chroma(frame.color, (self.w, self.h), c.chroma_gain)]
-        if semantic is not None:
+        if semantic is not None and self.config.semantic.enabled:
             edges.append((self.shrink(semantic).astype(np.float32), c.semantic_contrast))
         weight = 0.05 + np.minimum(np.abs(log_odds), 3.0) / 3
-        evidence = self._saturated(log_odds) if semantic is None else log_odds
-        pooled = region_mean(edges, evidence, weight, c.region_px, c.region_contrast)
+        pooled = region_mean(edges, log_odds, weight, c.region_px, c.region_contrast)
         a, b = guided_coefficients(guide, pooled, self._edge_px, c.edge_contrast)
         full = self.full(a) * frame.gray + self.full(b)
         full = self._fine(full, frame, c.fine_contrast)
-        if semantic is None:
-            full = self._unsaturated(full)
         if sharp is not None:
             alone = self.full(np.minimum(np.abs(sharp) / 2, 1))
             full = alone * self.full(log_odds) + (1 - alone) * full
         return np.clip(full, -limit, limit).astype(np.float32)
-
-    def _saturated(self, log_odds: Array) -> Array:
-        """-1 … 1 of log-odds, base rate included: smoothed over an outline these cross 0 on it.
-
-        Log-odds that are clipped, without the base rate, cross what it asks for within: things lose their rim.
-        """
-        width = np.float32(2 * self.config.refinement.saturation)
-        return np.tanh((log_odds + self._base_log_odds()) / width)
-
-    def _unsaturated(self, pooled: Array) -> Array:
-        """The log-odds again, without the base rate."""
-        width = np.float32(2 * self.config.refinement.saturation)
-        return width * np.arctanh(np.clip(pooled, -MOST_SURE, MOST_SURE)) - self._base_log_odds()
-
-    def _base_log_odds(self) -> np.float32:
-        return np.float32(np.log(self.config.base_rate) - np.log1p(-self.config.base_rate))
 
     def _fine(self, full: Array, frame: DynamicsInput, contrast: float) -> Array:
         """Log-odds (h, w) brought to the photograph's own edges of colour; as they are where there is no colour."""
@@ -98,7 +77,8 @@ class EdgeRefinement:
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""
         if semantic is None or not self.config.semantic.enabled:
-            return np.full((self.height, self.width), self._base_log_odds(), np.float32)
+            base = np.log(self.config.base_rate) - np.log1p(-self.config.base_rate)
+            return np.full((self.height, self.width), base, np.float32)
         check_image(semantic, "semantic", self.width, self.height)
         floor, missed = self.config.semantic.floor, self.config.semantic.missed
         least: Array | float = floor
