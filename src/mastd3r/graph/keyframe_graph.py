@@ -208,16 +208,16 @@ class KeyframeGraph:
 
     def drop_submap(self, submap: int | None = None) -> None:
         """Forget the keyframes of a submap, by default of the one being tracked; its frames become lost."""
-        gone = set(self.members(submap))
-        new = {k: n for n, k in enumerate(kf.id for kf in self.keyframes if kf.id not in gone)}
-        self.keyframes = [replace(kf, id=new[kf.id]) for kf in self.keyframes if kf.id in new]
+        kept = sorted(set(self.variables) - set(self.members(submap)))
+        new = {k: n for n, k in enumerate(kept)}
+        self.keyframes = [replace(self.keyframes[k], id=n) for k, n in new.items()]
         self.edges = [replace(e, i=new[e.i], j=new[e.j]) for e in self.edges if e.i in new and e.j in new]
-        self.variables = {new[k]: v for k, v in self.variables.items() if k in new}
-        self.submap_of = {new[k]: s for k, s in self.submap_of.items() if k in new}
+        self.variables = {n: self.variables[k] for k, n in new.items()}
+        self.submap_of = {n: self.submap_of[k] for k, n in new.items()}
         for r in self.records:
-            if r.kf_id in gone:
+            if r.kf_id not in new:
                 r.state, r.is_keyframe, (r.points, r.target, r.weight) = "lost", False, no_matches()
-            r.kf_id = new.get(r.kf_id, max(sum(k < r.kf_id for k in new) - 1, 0))
+            r.kf_id = max(int(np.searchsorted(kept, r.kf_id, "right")) - 1, 0)
         self.started.discard(self.submap if submap is None else submap)
 
     def part(self) -> KeyframeGraph:

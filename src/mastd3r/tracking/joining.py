@@ -54,10 +54,12 @@ def join_recognised(
 def give_up_unscaled(graph: KeyframeGraph, submap: int, unscaled: list[TwoView]) -> bool:
     """Drop a submap that could not be joined though larger ones see it: its frames are looked for in those.
 
-    A piece whose scale is not known has depths of no use, and would be placed by continuity alone.
+    A piece whose scale is not known has depths of no use, and would be placed by continuity alone. A saved map has no
+    say: where the video is not found in it, its own pieces are all that there is.
     """
     count = len(graph.members(submap))
-    larger = [v for v in unscaled if len(graph.members(graph.submap_of[v.anchor.id])) > count]
+    own = [v for v in unscaled if v.anchor.id >= graph.held]
+    larger = [v for v in own if len(graph.members(graph.submap_of[v.anchor.id])) > count]
     if len(larger) < LEAST_UNSCALED:
         return False
     log.info("submap %d of %d keyframes is seen by others, but has no scale: its frames are lost", submap, count)

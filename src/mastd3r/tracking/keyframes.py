@@ -216,12 +216,10 @@ class Keyframes:
         aside, self._newest_at, self.edges.flows = memory
         self._pending = None if aside is None else Future.done(aside)
 
-    def joins(self, kf: Keyframe) -> bool:
-        """True where ``kf`` shows a place of another submap, and the two have become one."""
-        return self._joins(kf, [])
-
-    def _joins(self, kf: Keyframe, unscaled: list[TwoView]) -> bool:
-        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places, self.entry, unscaled)
+    def joins(self, kf: Keyframe, unscaled: list[TwoView] | None = None) -> bool:
+        """True where ``kf`` shows a place of another submap, and the two have become one; see ``join_recognised``."""
+        views = [] if unscaled is None else unscaled
+        return join_recognised(self.graph, kf, self.two_view, self.edges, self.parts.places, self.entry, views)
 
     # -- after the last frame --------------------------------------------------------------------------------
 
@@ -249,7 +247,7 @@ class Keyframes:
         graph = self.graph
         for submap in sorted(graph.started)[1:]:
             graph.submap, unscaled = submap, list[TwoView]()
-            joined = any(self._joins(graph.keyframes[k], unscaled) for k in graph.members())
+            joined = any(self.joins(graph.keyframes[k], unscaled) for k in graph.members())
             if not joined and give_up_unscaled(graph, submap, unscaled):
                 graph.submap = graph.submap_of[graph.latest.id]
                 self.edges.flows = {}  # by numbers that keyframes had
