@@ -72,7 +72,7 @@ def solve(
     for i, term in problem.terms.items():
         variables[i].depth_info = term.depth_info
     intrinsics.values = end.g
-    lens = None if found.hess is None else _lens_covariance(found.hess)
+    lens = _lens_covariance(found.hess) if found.hess is not None and intrinsics.free.any() else None
     known = lens is not None and intrinsics.free[0] and lens[0, 0] > 0
     sigma = float(np.sqrt(lens[0, 0])) if lens is not None and known else float("inf")
     return SolveReport(found.iterations, found.converged, found.cost_first, found.cost_last, sigma, lens)
