@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import torch
@@ -22,6 +24,7 @@ FAR_PERCENTILE = 95  # of the depths seen: where what has no neighbours is put
 FEW = 4  # blocks; fewer are left to the training
 BACKDROP_ALPHA = 0.9  # below, a backdrop is put behind a pixel once the training is over
 BACKDROP_LOGIT = 3.0  # of its Gaussians' opacity
+SeedsOf = Callable[[GaussianMap, View, Array, float, int], GaussianMap | None]
 
 
 def gaps_filled(gaussians: GaussianMap, views: list[View], poses: list[Array], near: float, room: int) -> GaussianMap:
@@ -30,14 +33,7 @@ def gaps_filled(gaussians: GaussianMap, views: list[View], poses: list[Array], n
     ``poses`` are the views' (4, 4) cam_from_world. Its depth is that of its neighbours in the picture (normalised
     convolution of inverse depth), far away where it has none. No more than ``room`` are added.
     """
-    for view, cam_from_world in zip(views, poses, strict=True):
-        if room <= 0:
-            break
-        added = _seeds_of_gaps(gaussians, view, cam_from_world, near, room)
-        if added is not None:
-            gaussians = gaussians.joined(added)
-            room -= len(added)
-    return gaussians
+    return _seeded(_seeds_of_gaps, gaussians, views, poses, near, room)
 
 
 def with_backdrop(gaussians: GaussianMap, views: list[View], poses: list[Array], near: float, room: int) -> GaussianMap:
@@ -46,10 +42,17 @@ def with_backdrop(gaussians: GaussianMap, views: list[View], poses: list[Array],
     What moves hides a part of the world from all photographs: nothing is trained there, and a viewer would look
     through a hole. Far behind everything, a backdrop hides nothing that is known. ``poses`` and ``room``: as above.
     """
+    return _seeded(_seeds_of_backdrop, gaussians, views, poses, near, room)
+
+
+def _seeded(
+    seeds_of: SeedsOf, gaussians: GaussianMap, views: list[View], poses: list[Array], near: float, room: int
+) -> GaussianMap:
+    """The map with what every view adds to all that is there by then."""
     for view, cam_from_world in zip(views, poses, strict=True):
         if room <= 0:
             break
-        added = _seeds_of_backdrop(gaussians, view, cam_from_world, near, room)
+        added = seeds_of(gaussians, view, cam_from_world, near, room)
         if added is not None:
             gaussians = gaussians.joined(added)
             room -= len(added)
@@ -71,7 +74,7 @@ def _seeds_of_gaps(
     image = cv2.resize(view.image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
     blocks = blocks[:: -(-len(blocks) // room)]
     z = 1 / np.maximum(filled[blocks[:, 1], blocks[:, 0]], 1e-9)
-    return _seeds_at(gaussians, view, cam_from_world, blocks, z, image)
+    return _seeds_at(gaussians, view, camera, cam_from_world, blocks, z, image)
 
 
 def _seeds_of_backdrop(
@@ -87,7 +90,7 @@ def _seeds_of_backdrop(
     image = np.rint(255 * np.clip(filled, 0, 1)).astype(np.uint8)
     blocks = blocks[:: -(-len(blocks) // room)]
     z = np.full(len(blocks), np.percentile((depth / np.maximum(alpha, 1e-9))[seen], FAR_PERCENTILE))
-    seeds = _seeds_at(gaussians, view, cam_from_world, blocks, z, image)
+    seeds = _seeds_at(gaussians, view, camera, cam_from_world, blocks, z, image)
     with torch.no_grad():
         seeds.opacity_logits.fill_(BACKDROP_LOGIT)
     return seeds
@@ -105,10 +108,16 @@ def _looked_at(
 
 
 def _seeds_at(
-    gaussians: GaussianMap, view: View, cam_from_world: Array, blocks: Array, z: Array, image: Array
+    gaussians: GaussianMap,
+    view: View,
+    camera: Camera,
+    cam_from_world: Array,
+    blocks: Array,
+    z: Array,
+    image: Array,
 ) -> GaussianMap:
-    """A Gaussian in the middle of every block (n, 2), at depth z (n,), of the colour that ``image`` has there."""
-    camera = shrunk(view.camera, max(1, round(view.camera.width / LOOK_PX)))
+    """A Gaussian in the middle of every block (n, 2) of a view's small ``camera``, at depth z (n,), of the colour that
+    ``image`` has there."""
     points = camera.rays(blocks) * z[:, None]
     world_from_cam = np.linalg.inv(cam_from_world)
     cloud = StaticCloud(
