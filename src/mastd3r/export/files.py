@@ -6,7 +6,6 @@ import errno
 import json
 import math
 import os
-import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import OutputError
+from ..reading.files import exists, is_dir, is_file
 
 REMEDY = {
     errno.ENOSPC: "free some space or choose another folder with --out",
@@ -50,7 +50,7 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
     """
     if path.name in ("", ".."):
         raise OutputError(f"{path}: expected a file with a name of its own to write, got a folder")
-    if _is_device(path):
+    if exists(path) and not (is_file(path) or is_dir(path)):
         raise OutputError(f"{path}: expected to write a file of its own, got a device or a pipe of that name")
     temporary = path.with_name(f"{path.name}.part{suffix}")
     with writing(path):
@@ -61,14 +61,6 @@ def replacing(path: Path, suffix: str = "") -> Iterator[Path]:
             with suppress(OSError):
                 temporary.unlink()
             raise
-
-
-def _is_device(path: Path) -> bool:
-    """True where a device, a pipe or a socket has that name."""
-    with suppress(OSError, ValueError):
-        mode = os.stat(path).st_mode
-        return not (stat.S_ISREG(mode) or stat.S_ISDIR(mode))
-    return False
 
 
 def write_text(path: Path, text: str) -> None:
