@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 
 from fuzz.case import Case, Room, kind
+from fuzz.kinds_words import short_run
 from fuzz.material import Shared, garbled, nasty, sparse
 
 MEMBERS = (
@@ -255,16 +256,6 @@ def weights(rng: random.Random, room: Room, shared: Shared) -> Case:
         ["weights", "download", file, "--as", "mine", "--yes", "--quiet"],
         ["weights", "download", file, "--as", "mast3r", "--yes", "--quiet"],
         ["weights", "path", file],
-        [
-            "run",
-            shared.one_image,
-            "--out",
-            room.out,
-            "--no-map",
-            "--quiet",
-            "--pointmaps=mast3r",
-            "--set",
-            f"networks.mast3r={file}",
-        ],
+        short_run(room, shared, "--pointmaps=mast3r", "--set", f"networks.mast3r={file}"),
     ]
     return Case(rng.choice(words))

@@ -13,6 +13,7 @@ from typing import Any
 
 from fuzz.case import Case, Room, kind
 from fuzz.kinds_runs import replace_somewhere
+from fuzz.kinds_words import short_run
 from fuzz.material import NAMES, NUMBERS, VALUES, Shared, garbled, garbled_text, nasty, sparse
 from helpers import blobs, give_up_rights, write_video
 
@@ -133,16 +134,8 @@ def segments(rng: random.Random, room: Room, shared: Shared) -> Case:
     """run --segment-frames, whose pieces are tracked by something that leaves nonsense."""
     if rng.random() < 0.4:
         number = f"--{rng.choice(MANY_NUMBERS)}={rng.choice(NUMBERS)}"
-        words: list[str | Path] = [
-            "run",
-            shared.one_image,
-            "--out",
-            room.out,
-            "--no-map",
-            "--quiet",
-            "--segment-frames=60",
-        ]
-        return Case([*words, number], partial(_tasks_are, _program(rng, room)))
+        words = short_run(room, shared, "--segment-frames=60", number)
+        return Case(words, partial(_tasks_are, _program(rng, room)))
     video = write_video(room.given / "long.mp4", blobs(2) * 100)
     if rng.random() < 0.3:
         (room.out / "segments").mkdir(parents=True)
