@@ -184,7 +184,7 @@ class Config:
     places: PlacesKind = "auto"  # what a place is recognised by; auto: the pointmap network's tokens where it has them
     correction: CorrectionKind = "coarse-to-fine"
     cloud: CloudKind = "sparse"  # dense: depth of every keyframe pixel too, as cloud_dense.ply; a minute or two
-    masks: MasksKind = "smoothed"  # of the second pass; causal: they know the frames before alone, in half the time
+    masks: MasksKind = "smoothed"  # of the second pass; causal: they know the frames before alone, cheaper
     scale: str = ""  # what metres are taken from, as --scale says it (metric/spec.py); empty: lengths stay map units
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     source: SourceConfig = field(default_factory=SourceConfig)

@@ -39,7 +39,7 @@ MINUTES_HELP = "train the map for so long, instead of for the number of steps of
 FORMS_SHOWN = ", ".join(FORMS.values())
 SCALE_HELP = f"everything in metres, taken from {FORMS_SHOWN} (default: map units)"
 MASKS_HELP = (
-    "of the second pass: from frames before and after, or causal: from those before alone, in half the time "
+    "of the second pass: from frames before and after, or causal: from those before alone, which costs less "
     f"(default {Config().masks})"
 )
 PRESET_HELP = "many options at once; fast: a first look; quality: dense cloud, finest map; paper: everything as printed"
