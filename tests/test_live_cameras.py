@@ -206,6 +206,15 @@ def test_a_lost_stream_is_found_again(tmp_path: Path) -> None:
     assert camera.said[-1].endswith("not found again within 0.7 s") and camera.state == "open"
 
 
+def test_a_video_file_on_a_server_ends_once(tmp_path: Path) -> None:
+    sent(tmp_path / "clip.mp4", 20)
+    with file_server() as server:
+        server.files["/clip.mp4"] = (tmp_path / "clip.mp4").read_bytes()
+        camera = open_camera(f"{server.url}/clip.mp4", CameraOptions(timeout_s=0.4, reconnect_s=5.0))
+        frames = list(camera.frames())
+    assert len(frames) == 20 and camera.said[0].endswith("s ended") and len(camera.said) == 1
+
+
 def test_frames_of_another_size_end_a_stream(tmp_path: Path) -> None:
     small, large = blobs(4, 64, 48), blobs(2, 96, 64)
     stream = b"".join(cv2.imencode(".jpg", i)[1].tobytes() for i in (*small, *large))

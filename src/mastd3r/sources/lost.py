@@ -34,6 +34,10 @@ class Lost(Exception):
     """The camera gives no more; the text says why."""
 
 
+class Ended(Lost):
+    """It has given all that it had: nothing is looked for again."""
+
+
 class Reconnecting:
     """A camera that is looked for again, for some seconds, when it is lost; ``connect`` is what a kind adds.
 
@@ -88,6 +92,9 @@ class Reconnecting:
                     last_s = time_s
                     yield CameraFrame(time_s, image, arrived)
                 why = "it ended"
+            except Ended as e:
+                self.said.append(f"{self.name}: {e}")
+                return
             except Lost as e:
                 why = str(e)
             finally:

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..reading.pictures import check_pixels
 from .camera import CameraOptions
-from .lost import Connection, Lost, Reconnecting
+from .lost import Connection, Ended, Lost, Reconnecting
 
 Array = NDArray[Any]
 OPEN = {"flags": "low_delay", "probesize": "500000", "analyzeduration": "1000000"}
 RTSP = {"rtsp_transport": "tcp"}  # UDP loses packets, which smears pictures
+STATED = {"mp4", "matroska", "avi"}  # files that say how long they are; of others FFmpeg guesses it
 TRIES = 100  # packets without a picture before a stream is none
 
 
@@ -92,7 +93,12 @@ class _Stream:
                 now = time.perf_counter()
                 own_s = None if frame.pts is None else float(frame.pts * frame.time_base)
                 yield own_s, now, _rgb(frame)
-        raise Lost("the stream ended" if tries is None or broken < tries else "no picture that can be decoded")
+        if tries is not None and broken >= tries:
+            raise Lost("no picture that can be decoded")
+        length = self._container.duration
+        if length is not None and set(self._container.format.name.split(",")) & STATED:  # it would only begin anew
+            raise Ended(f"the video of {length / av.time_base:.1f} s ended")
+        raise Lost("the stream ended")
 
 
 def _rgb(frame: Any) -> Array:
