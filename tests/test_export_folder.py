@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -66,6 +67,13 @@ def another_tools_record(root: Path) -> Path:
     return root / "out"
 
 
+def a_linked_folder_in_it(root: Path) -> Path:
+    export(root / "out", "a")
+    (root / "real").mkdir()
+    (root / "out" / "b").symlink_to(root / "real")
+    return root / "out"
+
+
 def a_file(root: Path) -> Path:
     (root / "out").write_text("a file")
     return root / "out"
@@ -89,7 +97,16 @@ def holds_the_source(root: Path) -> Path:
 
 @pytest.mark.parametrize(
     "case",
-    [added_to_an_export, somebody_elses, another_tools_record, a_file, a_link, in_the_source, holds_the_source],
+    [
+        added_to_an_export,
+        somebody_elses,
+        another_tools_record,
+        a_linked_folder_in_it,
+        a_file,
+        a_link,
+        in_the_source,
+        holds_the_source,
+    ],
     ids=lambda case: case.__name__,
 )
 def test_other_places_are_refused_untouched(case: object, tmp_path: Path) -> None:
@@ -99,3 +116,31 @@ def test_other_places_are_refused_untouched(case: object, tmp_path: Path) -> Non
         export(out, "b", inputs=(tmp_path / "photos",))
     assert "\n" not in str(caught.value)
     assert everything_in(tmp_path) == before
+
+
+def test_a_home_with_much_in_it_is_refused_by_its_first_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    somebody_elses(tmp_path)
+    for n in range(20):
+        (tmp_path / "out" / f"cache-{n}").mkdir()
+    listed: list[object] = []
+    scandir = os.scandir
+    monkeypatch.setattr(os, "scandir", lambda where: listed.append(where) or scandir(where))
+    with pytest.raises(OutputError, match="thesis"):
+        export(tmp_path / "out", "b")
+    assert 1 <= len(listed) < 5
+
+
+def test_what_cannot_be_listed_is_not_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export(tmp_path / "out", "a", "shut/b")
+    scandir = os.scandir
+
+    def refusing(where: object) -> object:
+        if Path(str(where)).name == "shut":
+            raise PermissionError(13, "Permission denied", str(where))
+        return scandir(where)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(os, "scandir", refusing)
+    with pytest.raises(OutputError, match="Permission denied"):
+        export(tmp_path / "out", "c")
+    monkeypatch.undo()
+    assert set(everything_in(tmp_path)) == {"out/a", "out/shut/b", "out/export.json"}

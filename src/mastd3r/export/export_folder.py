@@ -66,10 +66,21 @@ def _check(out: Path, kind: FolderKind) -> None:
     if not out.exists() or not any(out.iterdir()):
         return
     ours = _files_of(out, kind)
-    added = [p for p in sorted(out.rglob("*")) if not p.is_dir() and p.relative_to(out).as_posix() not in ours]
-    if added:
-        first = added[0].relative_to(out).as_posix()
+    first = next((p for p in _walked(out) if p not in ours), None)
+    if first is not None:
         raise OutputError(f"{out}: expected an empty folder or {kind.said}, got one with {first}; {ANOTHER}")
+
+
+def _walked(out: Path) -> Iterator[str]:
+    """Its files, links among them, one by one: what is asked for may be somebody's whole home. Raises OSError."""
+
+    def unreadable(error: OSError) -> None:
+        raise error
+
+    for folder, folders, names in os.walk(out, onerror=unreadable):
+        folders.sort()
+        linked = [name for name in folders if (Path(folder) / name).is_symlink()]
+        yield from ((Path(folder) / name).relative_to(out).as_posix() for name in sorted(names + linked))
 
 
 def _files_of(out: Path, kind: FolderKind) -> set[str]:
