@@ -50,6 +50,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without frames after": ("temporal.backward=false",),
     "without support": ("support.enabled=false",),
     "without regions": ("refinement.enabled=false",),
+    "without colours": ("colours.enabled=false",),
     "the tracking's gaps only": ("temporal.smoother_gaps=[1, 4]",),
     "paper, eq. (1)-(4)": ("variant=paper",),
 }

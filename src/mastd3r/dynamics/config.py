@@ -116,6 +116,19 @@ class RefinementConfig:
 
 
 @dataclass(frozen=True)
+class ColoursConfig:
+    """The last step of the refinement, where there is colour: outlines by the colours inside and outside of them."""
+
+    enabled: bool = True
+    rounds: Annotated[int, Range(1, 100)] = 3  # densities from the outline, the outline from densities
+    gain: NotNegative = 1.2  # weight of the log ratio of densities: pixels of one thing are no independent witnesses
+    max_log_odds: Positive = 3.5  # it is bounded by this
+    trusted_log_odds: Positive = 4.6  # and what came before by this (99 %)
+    reach_ratio: Share = 0.027  # of sqrt(width * height): so far an outline may grow
+    margin_ratio: Share = 0.07  # of the same: so far around is what does not move looked at
+
+
+@dataclass(frozen=True)
 class PaperConfig:
     """Thresholds of the variant ``paper``, eq. (1)-(3)."""
 
@@ -147,6 +160,7 @@ class DynamicsConfig:
     temporal: TemporalConfig = field(default_factory=TemporalConfig)
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    colours: ColoursConfig = field(default_factory=ColoursConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
 
     def while_tracking(self) -> DynamicsConfig:

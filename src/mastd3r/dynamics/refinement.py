@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .colours import by_colours
 from .config import DynamicsConfig
 from .data import DynamicsInput, check_image
 from .regions import Layer, guided_coefficients, region_mean
@@ -37,12 +38,16 @@ class EdgeRefinement:
             log_odds = log_odds + c.appearance.share * alike
             log_odds = np.clip(log_odds, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(log_odds, frame, sharp)
-        if semantic is not None and c.semantic.enabled:
-            shown = c.semantic.evidence_share * shown + self.semantic_log_odds(semantic)
-            return sigmoid(
-                self._fine(shown, frame, c.refinement.fine_contrast_semantic) if c.refinement.enabled else shown
-            )
-        return sigmoid(shown + self.semantic_log_odds(semantic))
+        prior = self.semantic_log_odds(semantic)
+        if semantic is None or not c.semantic.enabled:
+            shown = shown + prior
+        else:
+            shown = c.semantic.evidence_share * shown + prior
+            if c.refinement.enabled:
+                shown = self._fine(shown, frame, c.refinement.fine_contrast_semantic)
+        if c.refinement.enabled and c.colours.enabled and frame.color is not None:
+            shown = by_colours(shown, frame.color, c.colours, self._inside_edges)
+        return sigmoid(shown)
 
     def regions(self, log_odds: Array, frame: DynamicsInput, sharp: Array | None) -> Array:
         """Log-odds as whole objects, at full size: pooled inside edges, then brought to the full image's edges.
@@ -73,6 +78,13 @@ class EdgeRefinement:
         c, size = self.config.refinement, (self.width, self.height)
         fine = [(frame.gray, 1.0), *_chroma(frame.color, size, c.chroma_gain)]
         return region_mean(fine, full, None, c.fine_px, contrast)
+
+    def _inside_edges(self, log_odds: Array, lab: Array) -> Array:
+        """Log-odds (h, w) of any size, pooled inside the edges of its colours (h, w, 3) uint8 in Lab."""
+        c = self.config.refinement
+        reach_px = c.fine_px * log_odds.shape[1] / self.width
+        layers = [(cv2.extractChannel(lab, n), gain) for n, gain in enumerate((1.0, c.chroma_gain, c.chroma_gain))]
+        return region_mean(layers, log_odds.astype(np.float32), None, reach_px, c.fine_contrast)
 
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""
