@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import bz2
+import importlib
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
+import lz4.frame
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from helpers import blobs
 from mastd3r.errors import InputError
+from mastd3r.sources import bag_limits
 from mastd3r.sources.camera import CameraOptions, open_camera
 
 Array = NDArray[Any]
@@ -124,3 +129,52 @@ def test_a_bag_with_a_pipe_in_it_is_not_waited_for(tmp_path: Path) -> None:
     for path in (folder, file):
         with pytest.raises(InputError, match=r"expected .*got a named pipe|expected a file or a folder"):
             open_camera(path, CameraOptions())
+
+
+ZSTD = importlib.import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+CODECS = {
+    "bz2": (bz2.compress, bz2.BZ2Decompressor),
+    "lz4": (lz4.frame.compress, lz4.frame.LZ4FrameDecompressor),
+    "zstd": (ZSTD.compress, ZSTD.ZstdDecompressor),
+}
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_compressed_parts_are_unpacked_up_to_a_bound(codec: str) -> None:
+    compress, make = CODECS[codec]
+    packed = compress(b"one" * 1000) + compress(b"two")
+    assert bag_limits.unpacked(packed, make, 3003) == b"one" * 1000 + b"two"
+    with pytest.raises(ValueError, match="more than 0 MiB"):
+        bag_limits.unpacked(packed, make, 3002)
+    with pytest.raises(ValueError, match="ends too early"):
+        bag_limits.unpacked(compress(b"one" * 1000)[:-3], make)
+
+
+def compressed_bag(path: Path, mode: CompressionMode, plugin: StoragePlugin, side_px: int) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        message, name = image_message(store, 0, np.zeros((side_px, side_px, 3), np.uint8), "rgb8")
+        writer.write(writer.add_connection("/a", name, typestore=store), 0, bytes(store.serialize_cdr(message, name)))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("mode", "plugin"),
+    [
+        (CompressionMode.STORAGE, StoragePlugin.MCAP),
+        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
+        (CompressionMode.FILE, StoragePlugin.SQLITE3),
+    ],
+)
+def test_a_bag_that_unpacks_to_far_more_is_refused(
+    mode: CompressionMode, plugin: StoragePlugin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = compressed_bag(tmp_path / "bag", mode, plugin, 200)
+    assert open_camera(path, CameraOptions()).size == (200, 200)
+    monkeypatch.setattr(bag_limits, "MOST_FILE", 20_000)
+    monkeypatch.setattr(bag_limits, "MOST_RATIO", 1)
+    monkeypatch.setattr(bag_limits.unpacked, "__defaults__", (20_000,))
+    with pytest.raises(InputError, match="expected a ROS bag, got a compressed"):
+        open_camera(path, CameraOptions())

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..errors import InputError, MissingPackage
 from ..reading.files import check_plain, entries_of, is_dir, is_file, short
 from ..reading.pictures import check_pixels, decoded
+from .bag_limits import bound_rosbags
 from .camera import CameraFrame, CameraOptions
 from .lost import changed
 from .paced import paced
@@ -113,6 +114,7 @@ def _opened(path: Path) -> Iterator[Any]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
+    bound_rosbags()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
