@@ -11,7 +11,7 @@ MOST_FILE, MOST_RATIO = 2**30, 200  # a file that is larger, and so many times l
 
 
 def unpacked(data: bytes, make: Callable[[], Any], most: int = MOST) -> bytes:
-    """All frames of ``data``, one after the other, by decompressors that ``make`` makes; raises ValueError for more than ``most`` bytes, or a cut frame."""
+    """All frames of ``data``, one after the other. Raises ValueError for more than ``most`` bytes, or a cut frame."""
     parts, left = list[bytes](), most
     while data:
         one = make()
