@@ -93,6 +93,13 @@ def test_what_is_as_red_farther_off_does_not_begin_to_move() -> None:
     assert not np.any(after[5:25, 120:150] > 0) and np.all(after[5:25, 120:150] <= before[5:25, 120:150])
 
 
+def test_beside_a_semantic_map_an_outline_only_shrinks() -> None:
+    for box in (np.s_[36:84, 46:104], np.s_[43:83, 54:104]):
+        before = said(box, 0.7)
+        after = colours.by_colours(before, picture(10, 90), CONFIG, same, semantic=True)
+        assert not np.any((after > 0) & (before <= 0)) and iou(after) > iou(before) + 0.05
+
+
 def test_where_nothing_moves_nothing_is_changed() -> None:
     before = said(np.s_[0:2, 0:5])
     assert colours.by_colours(before, picture(10, 90), CONFIG, same) is before

@@ -20,13 +20,14 @@ LEAST_PX = 20  # moving pixels that say what moving ones look like
 UNSEEN_PX = 0.5  # pixels of either kind that a colour is taken to have been seen in
 
 
-def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Pooled) -> Array:
+def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Pooled, semantic: bool = False) -> Array:
     """Log-odds (h, w) float32 of P(moving), of which each pixel now also says which side has its colour.
 
     What moves and what lies within ``config.margin_ratio`` of it are two densities over Lab (a grid with linear
     weights), of log-odds above and below 0; the log of their ratio is evidence, joined with the log-odds that came
     and pooled inside edges; from those the densities are made anew, ``config.rounds`` times, the last at full size.
-    Nothing begins to move that is not within ``config.reach_ratio`` of what did (both in sqrt(h·w)).
+    Nothing begins to move that is not within ``config.reach_ratio`` of what did (both in sqrt(h·w)); nothing at all
+    where a ``semantic`` map has said where things end.
 
     ``color`` is (h, w, 3) uint8 RGB. The idea is that of GrabCut (Rother, Kolmogorov, Blake 2004), with histograms
     for its mixtures and a filter for its cut. As it came where next to nothing moves.
@@ -36,6 +37,7 @@ def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Poo
         return log_odds
     size = float(np.sqrt(log_odds.size))
     reach, margin = (max(1, round(ratio * size)) for ratio in (config.reach_ratio, config.margin_ratio))
+    gain, reach = (config.gain_semantic, 0) if semantic else (config.gain, reach)
     near = cv2.dilate(inside.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     x, y, w, h = cv2.boundingRect(near)
     box = np.s_[max(y - margin, 0) : y + h + margin, max(x - margin, 0) : x + w + margin]
@@ -45,16 +47,16 @@ def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Poo
     small, small_lab = (cv2.resize(a, half, interpolation=cv2.INTER_AREA) for a in (known, lab))
     found = small
     for _ in range(config.rounds - 1):
-        found = pooled(small + _evidence(small_lab, found, config), small_lab)
-    evidence = cv2.resize(_evidence(small_lab, found, config), known.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        found = pooled(small + _evidence(small_lab, found, gain, config), small_lab)
+    evidence = cv2.resize(_evidence(small_lab, found, gain, config), known.shape[::-1], interpolation=cv2.INTER_LINEAR)
     found = pooled(known + evidence, lab)
     out = log_odds.copy()
     out[box] = np.where(near[box] > 0, found, np.minimum(found, log_odds[box]))
     return out
 
 
-def _evidence(lab: Array, log_odds: Array, config: ColoursConfig) -> Array:
-    """Log of the ratio of the two densities at each pixel's colour, (h, w) float32, bounded."""
+def _evidence(lab: Array, log_odds: Array, gain: float, config: ColoursConfig) -> Array:
+    """``gain`` times the log of the ratio of the two densities at each pixel's colour, (h, w) float32, bounded."""
     p = 1 / (1 + np.exp(-log_odds))
     moving, still = (np.where(log_odds > 0, p, 0), np.where(log_odds > 0, 0, 1 - p))
     seen = np.zeros((*CELLS, 2), np.float32)
@@ -62,7 +64,7 @@ def _evidence(lab: Array, log_odds: Array, config: ColoursConfig) -> Array:
     share = float(np.log(max(moving.sum(), 1.0) / max(still.sum(), 1.0)))
     ratio = np.empty(log_odds.shape, np.float32)
     colour_ratio(lab, seen, UNSEEN_PX, share, ratio)
-    return np.clip(config.gain * ratio, -config.max_log_odds, config.max_log_odds)
+    return np.clip(gain * ratio, -config.max_log_odds, config.max_log_odds)
 
 
 _JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}

@@ -38,15 +38,12 @@ class EdgeRefinement:
             log_odds = log_odds + c.appearance.share * alike
             log_odds = np.clip(log_odds, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(log_odds, frame, sharp)
-        prior = self.semantic_log_odds(semantic)
-        if semantic is None or not c.semantic.enabled:
-            shown = shown + prior
-        else:
-            shown = c.semantic.evidence_share * shown + prior
-            if c.refinement.enabled:
-                shown = self._fine(shown, frame, c.refinement.fine_contrast_semantic)
+        joined = semantic is not None and c.semantic.enabled
+        shown = (c.semantic.evidence_share if joined else 1.0) * shown + self.semantic_log_odds(semantic)
+        if joined and c.refinement.enabled:
+            shown = self._fine(shown, frame, c.refinement.fine_contrast_semantic)
         if c.refinement.enabled and c.colours.enabled and frame.color is not None:
-            shown = by_colours(shown, frame.color, c.colours, self._inside_edges)
+            shown = by_colours(shown, frame.color, c.colours, self._inside_edges, joined)
         return sigmoid(shown)
 
     def regions(self, log_odds: Array, frame: DynamicsInput, sharp: Array | None) -> Array:
