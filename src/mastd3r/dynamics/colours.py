@@ -64,7 +64,7 @@ def _evidence(lab: Array, log_odds: Array, gain: float, config: ColoursConfig) -
     share = float(np.log(max(moving.sum(), 1.0) / max(still.sum(), 1.0)))
     ratio = np.empty(log_odds.shape, np.float32)
     colour_ratio(lab, seen, UNSEEN_PX, share, ratio)
-    return np.clip(gain * ratio, -config.max_log_odds, config.max_log_odds)
+    return np.clip(gain * ratio, -config.max_still_log_odds, config.max_log_odds)
 
 
 _JIT: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": True}

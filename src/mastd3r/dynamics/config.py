@@ -123,7 +123,8 @@ class ColoursConfig:
     rounds: Annotated[int, Range(1, 100)] = 3  # densities from the outline, the outline from densities
     gain: NotNegative = 1.2  # weight of the log ratio of densities
     gain_semantic: NotNegative = 0.5  # the same once a semantic map is joined, which knows where things end
-    max_log_odds: Positive = 3.5  # it is bounded by this
+    max_log_odds: Positive = 3.5  # it is bounded by this where it speaks for motion
+    max_still_log_odds: Positive = 2.0  # and by this where it speaks against: what is missed stays in the map
     trusted_log_odds: Positive = 4.6  # and what came before by this (99 %)
     reach_ratio: Share = 0.027  # of sqrt(width * height): so far an outline may grow; not at all beside a semantic map
     margin_ratio: Share = 0.07  # of the same: so far around is what does not move looked at
