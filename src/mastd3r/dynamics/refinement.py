@@ -69,8 +69,11 @@ class EdgeRefinement:
         return np.clip(full, -limit, limit).astype(np.float32)
 
     def _fine(self, full: Array, frame: DynamicsInput, contrast: float) -> Array:
-        """Log-odds (h, w) brought to the photograph's own edges of colour; as they are where there is no colour."""
-        if frame.color is None:
+        """Log-odds (h, w) brought to the photograph's own edges of colour; as they are where there is no colour.
+
+        And where the colours themselves are asked at the end, which pools them as well.
+        """
+        if frame.color is None or self.config.colours.enabled:
             return full
         c, size = self.config.refinement, (self.width, self.height)
         fine = [(frame.gray, 1.0), *_chroma(frame.color, size, c.chroma_gain)]
