@@ -11,8 +11,7 @@ import torch
 from ..config import MapLossKind
 from .ssim import ssim_map
 
-MOVING = 0.5  # P(moving) above this is "moving" in the hard variant
-SURELY_MOVING = 0.8  # P(moving) above this is not looked at by the default trainer
+MOVING = 0.5  # P(moving) above this is "moving" in the hard variant, and not looked at by the default trainer
 
 
 def squared_color_error(render: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -59,7 +58,7 @@ def pixel_weight(
     low-confidence points"): u is evidence. Alone (uncertainty) it takes a pixel's weight from 1 to lambda; beside the
     mask (full) it divides the odds of standing still by lambda^-u, so that it decides where the mask doubts and
     leaves alone what is surely static: flow is wrong at outlines and where the other views were covered.
-    Also, surely moving pixels get weight 0 under mask and full: Adam's steps do not depend on the size of a
+    Also, pixels that rather move than not get weight 0 under mask and full: Adam's steps do not depend on the size of a
     gradient, so where the background was never seen 5 % of the weight builds the whole ghost.
     plain has w = 1, mask has no u, uncertainty has w = 1 and u, full has both. 0 where there is no data.
     """
@@ -68,7 +67,7 @@ def pixel_weight(
         static = seen * discounted(static, u, lambda_uncertainty)
     weight = static_weight(static, dynamic_weight, hard) if kind in ("mask", "full") else seen
     if not paper and kind in ("mask", "full"):
-        return weight * (1 - static <= SURELY_MOVING)
+        return weight * (1 - static <= MOVING)
     if u is None or kind in ("plain", "mask"):
         return weight
     if paper:
