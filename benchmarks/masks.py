@@ -51,7 +51,7 @@ VARIANTS: dict[str, tuple[str, ...]] = {
     "without support": ("support.enabled=false",),
     "without regions": ("refinement.enabled=false",),
     "without colours": ("colours.enabled=false",),
-    "the tracking's gaps only": ("temporal.smoother_gaps=[1, 4]",),
+    "frames 12 apart, too": ("temporal.smoother_gaps=[1, 4, 12]",),
     "paper, eq. (1)-(4)": ("variant=paper",),
 }
 PERFECT = (

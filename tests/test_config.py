@@ -178,10 +178,10 @@ def leaf(config: Any, dotted: str) -> Any:
 
 def test_sections_of_sections_are_read_from_yaml_and_from_words(tmp_path: Path) -> None:
     file = tmp_path / "c.yaml"
-    file.write_text("dynamics:\n  temporal:\n    smoother_gaps: [1, 4]\n  motion: {enabled: false}\n")
+    file.write_text("dynamics:\n  temporal:\n    smoother_gaps: [1, 5]\n  motion: {enabled: false}\n")
     config = with_override(config_from_yaml(file), "dynamics.appearance.share=1")
     d = config.dynamics
-    assert (d.temporal.smoother_gaps, d.motion.enabled, d.appearance.share) == ((1, 4), False, 1.0)
+    assert (d.temporal.smoother_gaps, d.motion.enabled, d.appearance.share) == ((1, 5), False, 1.0)
     assert d.temporal.filter_gaps == Config().dynamics.temporal.filter_gaps
     assert config_from_dict(yaml.safe_load(config_to_yaml(config))) == config
 

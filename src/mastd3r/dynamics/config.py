@@ -79,11 +79,7 @@ class TemporalConfig:
     memory: Share = 0.85  # share of the carried log-odds that is kept from one frame to the next
     carry_mismatch: Positive = 10.0  # normalised grey mismatch from which the carried log-odds fade
     filter_gaps: tuple[OneOrMore, ...] = (1, 4)  # frames back that the frame is compared with while tracking
-    smoother_gaps: tuple[OneOrMore, ...] = (
-        1,
-        4,
-        12,
-    )  # frames back and forth, in the smoothing pass; the last is its delay
+    smoother_gaps: tuple[OneOrMore, ...] = (1, 4)  # back and forth, in the smoothing pass; the last is its delay
     backward: bool = True  # smoothing pass: frames after this one are evidence too
 
 
