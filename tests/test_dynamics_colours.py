@@ -20,7 +20,7 @@ CONFIG = ColoursConfig()
 THING = np.s_[40:80, 50:100]
 
 
-def same(log_odds: Array, lab: Array) -> Array:
+def same(log_odds: Array, lab: Array, scale: float) -> Array:
     """No pooling."""
     return log_odds
 
@@ -130,3 +130,19 @@ def test_the_refinement_asks_colours_where_there_are_any_and_where_it_is_let() -
     assert np.array_equal(refined(config, None), refined(without, None))
     off = replace(plain, colours=CONFIG)
     assert np.array_equal(refined(plain, color), refined(off, color))
+
+
+def test_pooling_reaches_as_far_whatever_part_of_the_image_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    reached: list[float] = []
+
+    def pooled(layers: object, value: Array, weight: object, radius_px: float, edge: float) -> Array:
+        reached.append(radius_px)
+        return value
+
+    monkeypatch.setattr("mastd3r.dynamics.refinement.region_mean", pooled)
+    config = DynamicsConfig()
+    for box in (np.s_[30:40, 30:40], np.s_[10:110, 10:150]):
+        refinement, color = EdgeRefinement(config, W, H), picture(10, 90)
+        colours.by_colours(said(box), color, CONFIG, refinement._inside_edges)
+    full = config.refinement.fine_px
+    assert reached == [full / 2, full / 2, full] * 2

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .config import ColoursConfig
 
 Array = NDArray[Any]
-Pooled = Callable[[Array, Array], Array]  # (log-odds, colours in Lab) of one size -> the log-odds inside their edges
+Pooled = Callable[[Array, Array, float], Array]  # (log-odds, colours in Lab, their scale) -> pooled inside edges
 CELL_L, CELL_AB = 32.0, 4.0  # of 255: shading changes lightness, not the two colour differences
 CELLS = (int(255 / CELL_L) + 2, int(255 / CELL_AB) + 2, int(255 / CELL_AB) + 2)
 LEAST_PX = 20  # moving pixels that say what moving ones look like
@@ -47,9 +47,9 @@ def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Poo
     small, small_lab = (cv2.resize(a, half, interpolation=cv2.INTER_AREA) for a in (known, lab))
     found = small
     for _ in range(config.rounds - 1):
-        found = pooled(small + _evidence(small_lab, found, gain, config), small_lab)
+        found = pooled(small + _evidence(small_lab, found, gain, config), small_lab, 0.5)
     evidence = cv2.resize(_evidence(small_lab, found, gain, config), known.shape[::-1], interpolation=cv2.INTER_LINEAR)
-    found = pooled(known + evidence, lab)
+    found = pooled(known + evidence, lab, 1.0)
     out = log_odds.copy()
     out[box] = np.where(near[box] > 0, found, np.minimum(found, log_odds[box]))
     return out

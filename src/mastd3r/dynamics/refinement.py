@@ -79,12 +79,11 @@ class EdgeRefinement:
         fine = [(frame.gray, 1.0), *_chroma(frame.color, size, c.chroma_gain)]
         return region_mean(fine, full, None, c.fine_px, contrast)
 
-    def _inside_edges(self, log_odds: Array, lab: Array) -> Array:
-        """Log-odds (h, w) of any size, pooled inside the edges of its colours (h, w, 3) uint8 in Lab."""
+    def _inside_edges(self, log_odds: Array, lab: Array, scale: float) -> Array:
+        """Log-odds (h, w) at ``scale`` times full size, pooled inside the edges of their colours (h, w, 3) in Lab."""
         c = self.config.refinement
-        reach_px = c.fine_px * log_odds.shape[1] / self.width
         layers = [(cv2.extractChannel(lab, n), gain) for n, gain in enumerate((1.0, c.chroma_gain, c.chroma_gain))]
-        return region_mean(layers, log_odds.astype(np.float32), None, reach_px, c.fine_contrast)
+        return region_mean(layers, log_odds.astype(np.float32), None, scale * c.fine_px, c.fine_contrast)
 
     def semantic_log_odds(self, semantic: Array | None) -> Array:
         """Log-odds of P(D|S), (h, w) float32; the base rate's where there is no map."""
