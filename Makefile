@@ -50,7 +50,7 @@ bench: setup
 
 fuzz: setup
 	@mkdir -p runs
-	PYTHONPATH=tests $(BIN)/python -m fuzz --cases 1000 --seed $(SEED) --out runs/fuzz.json
+	PYTHONPATH=tests $(BIN)/python -m fuzz --cases 1050 --seed $(SEED) --out runs/fuzz.json
 
 docs: setup
 	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[docs]'

@@ -85,6 +85,15 @@ def test_a_thing_of_the_colours_around_it_stays_as_it_came() -> None:
     assert np.mean((before > 0) != (after > 0)) < 0.01
 
 
+def test_colours_alone_do_not_outweigh_what_surely_moves() -> None:
+    """A patch of the wall's own hue on the thing is kept by evidence above the bound, and lost to a higher one."""
+    color, patch = picture(10, 90), np.s_[57:63, 72:78]  # without its rim, where pixels are mixed at half size
+    color[55:65, 70:80] = color[10:20, 10:20]
+    before = said(THING, 2.5)
+    assert np.all(colours.by_colours(before, color, CONFIG, same)[patch] > 0)
+    assert not np.any(colours.by_colours(before, color, replace(CONFIG, max_still_log_odds=3.5), same)[patch] > 0)
+
+
 def test_what_is_as_red_farther_off_does_not_begin_to_move() -> None:
     color = picture(10, 90)
     color[5:25, 120:150] = color[45:65, 60:90]

@@ -15,11 +15,13 @@ import lz4.frame
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag1 import reader as rosbag1_reader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, storage_mcap
+from rosbags.rosbag2 import reader as rosbag2_reader
 from rosbags.typesys import Stores, get_typestore
 
 from helpers import blobs
-from mastd3r.errors import InputError
+from mastd3r.errors import InputError, MissingPackage
 from mastd3r.sources import bag_limits
 from mastd3r.sources.camera import CameraOptions, open_camera
 
@@ -147,7 +149,7 @@ def test_compressed_parts_are_unpacked_up_to_a_bound(codec: str) -> None:
     with pytest.raises(ValueError, match="more than 0 MiB"):
         bag_limits.unpacked(packed, make, 3002)
     with pytest.raises(ValueError, match="ends too early"):
-        bag_limits.unpacked(compress(b"one" * 1000)[:-3], make)
+        bag_limits.unpacked(compress(b"one" * 1000)[:-3], make, 3003)
 
 
 def compressed_bag(path: Path, mode: CompressionMode, plugin: StoragePlugin, side_px: int) -> Path:
@@ -175,6 +177,25 @@ def test_a_bag_that_unpacks_to_far_more_is_refused(
     assert open_camera(path, CameraOptions()).size == (200, 200)
     monkeypatch.setattr(bag_limits, "MOST_FILE", 20_000)
     monkeypatch.setattr(bag_limits, "MOST_RATIO", 1)
-    monkeypatch.setattr(bag_limits.unpacked, "__defaults__", (20_000,))
+    monkeypatch.setattr(bag_limits, "MOST", 20_000)
     with pytest.raises(InputError, match="expected a ROS bag, got a compressed"):
         open_camera(path, CameraOptions())
+
+
+def test_every_codec_that_rosbags_knows_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    bag_limits.bound_rosbags()
+    known = [(name, lambda data, f=f: f(data, 1001)) for name, f in storage_mcap.DECOMPRESSORS.items() if name]
+    known += [(name, f) for name, f in rosbag1_reader.decompressors.items() if name in CODECS]
+    assert sorted(name for name, _ in known) == ["bz2", "lz4", "lz4", "zstd"]
+    monkeypatch.setattr(bag_limits, "MOST", 1000)
+    for name, decompress in known:
+        assert decompress(CODECS[name][0](bytes(1000))) == bytes(1000)
+        with pytest.raises(ValueError, match="more than"):
+            decompress(CODECS[name][0](bytes(1001)))
+
+
+def test_a_rosbags_that_cannot_be_bounded_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = bag(tmp_path / "bag", one_image(lambda data: data))
+    monkeypatch.delattr(rosbag2_reader, "zstd")
+    with pytest.raises(MissingPackage, match=r"rosbags, 0\.11\.7 or newer"):
+        open_camera(folder, CameraOptions())

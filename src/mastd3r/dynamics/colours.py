@@ -36,8 +36,8 @@ def by_colours(log_odds: Array, color: Array, config: ColoursConfig, pooled: Poo
     if np.count_nonzero(inside) < LEAST_PX:
         return log_odds
     size = float(np.sqrt(log_odds.size))
-    reach, margin = (max(1, round(ratio * size)) for ratio in (config.reach_ratio, config.margin_ratio))
-    gain, reach = (config.gain_semantic, 0) if semantic else (config.gain, reach)
+    gain, reach = (config.gain_semantic, 0) if semantic else (config.gain, max(1, round(config.reach_ratio * size)))
+    margin = max(1, round(config.margin_ratio * size))
     near = cv2.dilate(inside.view(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
     x, y, w, h = cv2.boundingRect(near)
     box = np.s_[max(y - margin, 0) : y + h + margin, max(x - margin, 0) : x + w + margin]
@@ -79,6 +79,16 @@ def _cell(value: int, size: float) -> tuple[int, Any]:
     return below, at - _F(below)
 
 
+@numba.njit(inline="always", **_JIT)
+def _corner(n: int, tl: float, ta: float, tb: float) -> tuple[int, int, int, Any]:
+    """(steps to the n-th of eight cells, its share of a colour)."""
+    dl, da, db = n >> 2, n >> 1 & 1, n & 1
+    w = tl if dl else _F(1) - tl
+    w *= ta if da else _F(1) - ta
+    w *= tb if db else _F(1) - tb
+    return dl, da, db, w
+
+
 @numba.njit(**_JIT)
 def add_colours(lab: Array, moving: Array, still: Array, seen: Array) -> None:
     """Add the weights of each pixel to the eight cells around its colour; ``lab`` (h, w, 3), ``seen`` (l, a, b, 2)."""
@@ -89,10 +99,7 @@ def add_colours(lab: Array, moving: Array, still: Array, seen: Array) -> None:
             a, ta = _cell(lab[y, x, 1], CELL_AB)
             b, tb = _cell(lab[y, x, 2], CELL_AB)
             for n in range(8):
-                dl, da, db = n >> 2, n >> 1 & 1, n & 1
-                w = tl if dl else _F(1) - tl
-                w *= ta if da else _F(1) - ta
-                w *= tb if db else _F(1) - tb
+                dl, da, db, w = _corner(n, tl, ta, tb)
                 seen[l + dl, a + da, b + db, 0] += w * m
                 seen[l + dl, a + da, b + db, 1] += w * s
 
@@ -108,10 +115,7 @@ def colour_ratio(lab: Array, seen: Array, unseen: float, share: float, out: Arra
             b, tb = _cell(lab[y, x, 2], CELL_AB)
             moving, still = prior, _F(unseen)
             for n in range(8):
-                dl, da, db = n >> 2, n >> 1 & 1, n & 1
-                w = tl if dl else _F(1) - tl
-                w *= ta if da else _F(1) - ta
-                w *= tb if db else _F(1) - tb
+                dl, da, db, w = _corner(n, tl, ta, tb)
                 moving += w * seen[l + dl, a + da, b + db, 0]
                 still += w * seen[l + dl, a + da, b + db, 1]
             out[y, x] = np.log(moving / still) - _F(share)

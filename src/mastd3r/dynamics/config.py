@@ -108,7 +108,7 @@ class RefinementConfig:
     edge_contrast: Positive = 20.0  # grey levels that it takes for an edge
     fine_px: Positive = 24.0  # full-size pixels, reach of the last pooling, where there is colour
     fine_contrast: Positive = 12.0  # grey levels that are as far as fine_px
-    fine_contrast_semantic: Positive = 20.0  # the same once a semantic map is joined, whose own edges are coarse
+    fine_contrast_semantic: Positive = 20.0  # the same once a semantic map is joined; where ``colours`` is off
 
 
 @dataclass(frozen=True)

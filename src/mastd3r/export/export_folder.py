@@ -47,7 +47,7 @@ def export_folder(
         staged.mkdir()
         try:
             yield staged
-            files = sorted(p.relative_to(staged).as_posix() for p in staged.rglob("*") if p.is_file())
+            files = sorted(_walked(staged))
             write_json(staged / kind.record, {"made_by": kind.made_by, **facts, "files": files})
             _replace(out, staged)
         except BaseException:

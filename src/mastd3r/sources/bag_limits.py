@@ -10,7 +10,7 @@ MOST = 512 * 2**20  # bytes of a chunk or a message; writers make chunks of a fe
 MOST_FILE, MOST_RATIO = 2**30, 200  # a file that is larger, and so many times larger than it was, is no recording
 
 
-def unpacked(data: bytes, make: Callable[[], Any], most: int = MOST) -> bytes:
+def unpacked(data: bytes, make: Callable[[], Any], most: int) -> bytes:
     """All frames of ``data``, one after the other. Raises ValueError for more than ``most`` bytes, or a cut frame."""
     parts, left = list[bytes](), most
     while data:
@@ -58,7 +58,7 @@ class _BoundedZstd:
 
     def decompress(self, data: bytes) -> bytes:
         """A whole message or chunk."""
-        return unpacked(bytes(data), self._zstd.ZstdDecompressor)
+        return unpacked(bytes(data), self._zstd.ZstdDecompressor, MOST)
 
     def open(self, file: Any, mode: str = "rb", **options: Any) -> Any:
         """A file; what is read of it is counted."""
@@ -71,7 +71,7 @@ class _BoundedZstd:
 
 
 def bound_rosbags() -> None:
-    """rosbags unpacks within these bounds from here on."""
+    """rosbags unpacks within these bounds from here on. Raises ImportError, AttributeError where it is not as known."""
     import lz4.frame
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import reader as rosbag2
@@ -82,10 +82,10 @@ def bound_rosbags() -> None:
     zstd = _BoundedZstd(rosbag2.zstd)
     rosbag2.zstd = zstd
     mcap.DECOMPRESSORS |= {
-        "lz4": lambda data, _: unpacked(data, lz4.frame.LZ4FrameDecompressor),
+        "lz4": lambda data, _: unpacked(data, lz4.frame.LZ4FrameDecompressor, MOST),
         "zstd": lambda data, _: zstd.decompress(data),
     }
     rosbag1.decompressors |= {
-        "bz2": lambda data: unpacked(data, bz2.BZ2Decompressor),
-        "lz4": lambda data: unpacked(data, lz4.frame.LZ4FrameDecompressor),
+        "bz2": lambda data: unpacked(data, bz2.BZ2Decompressor, MOST),
+        "lz4": lambda data: unpacked(data, lz4.frame.LZ4FrameDecompressor, MOST),
     }

@@ -23,7 +23,7 @@ from .lost import changed
 from .paced import paced
 
 Array = NDArray[Any]
-PACKAGE = "a ROS bag needs the package rosbags: pip install 'mastd3r-slam[ros]'"
+PACKAGE = "a ROS bag needs the package rosbags, 0.11.7 or newer: pip install 'mastd3r-slam[ros]'"
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 MOST_SAID = 200  # characters of what rosbags says
 SUFFIXES = (".mcap", ".db3", ".bag")
@@ -54,8 +54,8 @@ class RosBag:
     def __init__(self, path: Path, options: CameraOptions) -> None:
         """Look for the topic, and read its first image. Raises InputError, MissingPackage."""
         try:
-            import rosbags.highlevel  # noqa: F401
-        except ImportError as e:
+            bound_rosbags()
+        except (ImportError, AttributeError) as e:
             raise MissingPackage(PACKAGE) from e
         for part in entries_of(path) if is_dir(path) else [path]:
             check_plain(part, "files of a ROS bag")  # a pipe among them would be waited for
@@ -114,7 +114,6 @@ def _opened(path: Path) -> Iterator[Any]:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    bound_rosbags()
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
