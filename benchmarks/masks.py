@@ -33,7 +33,7 @@ from mastd3r.export.machine import machine_info
 from mastd3r.export.pictures import mask_overlay
 from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph, trajectory_of
 from mastd3r.offline.smoothing import FrameMask, SmoothingContext, smooth_masks
-from mastd3r.registry import DYNAMICS
+from mastd3r.parts import dynamics_beside
 from mastd3r.slam import Slam
 from mastd3r.sources import open_source
 from mastd3r.types import Source
@@ -201,7 +201,7 @@ class Tracked:
         map_view = MapView(self.slam.graph.camera().resized(*self.source.size), 320, 2.0)
         known = self.slam.masks.filter.appearance
         learned = None if known is None else known.copy()
-        parts = replace(self.slam.parts, dynamics=DYNAMICS.create(config.dynamics.variant, config.dynamics))
+        parts = replace(self.slam.parts, dynamics=dynamics_beside(self.slam.parts.semantics, config.dynamics))
         context = SmoothingContext(self.final, self.slam.graph, parts, config, map_view, appearance=learned)
         smooth_masks(islice(self.source.frames(), *(frames or (None,))), context, on_mask)
         found = mask_error(pairs)

@@ -76,7 +76,7 @@ HEAVY = {  # package: who may import it
     "safetensors": {"networks"},
     "gsplat": {"mapping"},
     "av": {"sources", "export"},  # reads videos, writes them
-    "numba": {"geometry", "dynamics", "mapping", "pointmap", "mvs"},
+    "numba": {"geometry", "dynamics", "mapping", "pointmap", "mvs", "networks"},
     "rich": {"cli"},
     "viser": {"viewer"},  # the optional browser viewer
     "ray": {"tasks"},  # optional clusters

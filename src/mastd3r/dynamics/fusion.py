@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
+from .people import without_still
 from .pixels import JIT, between_pixels
 from .refinement import EdgeRefinement
 
@@ -120,6 +122,8 @@ def shown_mask(
     refinement: EdgeRefinement, log_odds: Array, frame: DynamicsInput, appearance: Array | None, terms: dict[str, Array]
 ) -> DynamicMask:
     """The mask of log-odds at half size, with the semantics and the appearance that the frame has."""
+    if frame.semantic is not None and not refinement.config.semantic.shows_all:
+        frame = replace(frame, semantic=without_still(frame.semantic, log_odds))
     p = refinement.probability(log_odds, frame, appearance, terms.get("depth"))
     if frame.semantic is not None and refinement.config.semantic.enabled:
         terms["semantic"] = refinement.semantic_log_odds(frame.semantic)

@@ -38,8 +38,8 @@ class EdgeRefinement:
             log_odds = log_odds + c.appearance.share * alike
             log_odds = np.clip(log_odds, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(log_odds, frame, sharp)
-        joined = semantic is not None and c.semantic.enabled
-        shown = (c.semantic.evidence_share if joined else 1.0) * shown + self.semantic_log_odds(semantic)
+        joined = semantic is not None and c.semantic.enabled and c.semantic.shows_all
+        shown = c.semantic.share_beside(semantic) * shown + self.semantic_log_odds(semantic)
         if joined and c.refinement.enabled:
             shown = self._fine(shown, frame, c.refinement.fine_contrast_semantic)
         if c.refinement.enabled and c.colours.enabled and frame.color is not None:
@@ -91,6 +91,9 @@ class EdgeRefinement:
             base = np.log(self.config.base_rate) - np.log1p(-self.config.base_rate)
             return np.full((self.height, self.width), base, np.float32)
         check_image(semantic, "semantic", self.width, self.height)
+        if not self.config.semantic.shows_all:
+            p = np.clip(semantic, self.config.base_rate, self.config.semantic.most_partial).astype(np.float32)
+            return np.log(p / (1 - p)).astype(np.float32)
         floor, missed = self.config.semantic.floor, self.config.semantic.missed
         least: Array | float = floor
         if missed > floor:

@@ -19,6 +19,7 @@ from .flow import HalfFlow
 from .fusion import accumulated, alike, carried_along, kept_share, shown_mask, with_depth
 from .motion import texture_information
 from .motion_test import Aligned, MotionTest, Past, Present
+from .people import without_still
 from .photometric import photo_variance
 from .refinement import EdgeRefinement, sigmoid
 
@@ -193,5 +194,7 @@ class ForwardBackwardSmoother:
         semantic, c = frame.input.semantic, self.config
         if semantic is None or not c.semantic.enabled:
             return sigmoid(log_odds + np.float32(np.log(c.base_rate / (1 - c.base_rate))))
+        if not c.semantic.shows_all:
+            semantic = without_still(semantic, log_odds)
         prior = self.refinement.shrink(self.refinement.semantic_log_odds(semantic))
-        return sigmoid(c.semantic.evidence_share * log_odds + prior)
+        return sigmoid(c.semantic.share_beside(semantic) * log_odds + prior)

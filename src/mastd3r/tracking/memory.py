@@ -24,6 +24,7 @@ class TrackingMemory:
     keyframes: tuple[KeyframeGraph | None, int, dict[tuple[int, int], Any]]  # see Keyframes.memory
     mask: Any  # of the filter
     features: Any
+    semantics: Any = None
 
 
 def can_remember(masks: MaskTracker) -> bool:
@@ -39,7 +40,8 @@ def memory_of(state: TrackingState, keyframes: Keyframes, masks: MaskTracker, pa
         state = replace(state, last=TrackedFrame(state.last.work, None))  # type: ignore[arg-type]
     frames = [kf.work for kf in graph.keyframes] + ([state.last.work] if state.last is not None else [])
     features = getattr(parts.features, "memory", lambda _: None)(frames)
-    return TrackingMemory(graph, state, moving, keyframes.memory(), masks.memory(), features)
+    semantics = getattr(parts.semantics, "memory", lambda: None)()
+    return TrackingMemory(graph, state, moving, keyframes.memory(), masks.memory(), features, semantics)
 
 
 def remember(memory: TrackingMemory, keyframes: Keyframes, masks: MaskTracker, parts: Parts) -> TrackingState:
@@ -49,6 +51,8 @@ def remember(memory: TrackingMemory, keyframes: Keyframes, masks: MaskTracker, p
     masks.remember(memory.mask)
     if memory.features is not None:
         parts.features.remember(memory.features)  # type: ignore[attr-defined]
+    if memory.semantics is not None:
+        parts.semantics.remember(memory.semantics)  # type: ignore[attr-defined]
     state = memory.state
     if state.last is None:
         return state
