@@ -24,8 +24,10 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "kitchen, depth pointmaps": ("kitchen", ["--pointmaps", "depth", "--end", "200", "--no-map"]),
     "kitchen_walk": ("kitchen_walk", []),
     "kitchen_walk, no semantics": ("kitchen_walk", ["--semantics", "none", "--no-map"]),
+    "kitchen_walk, people": ("kitchen_walk", ["--semantics", "people", "--no-map"]),
     "kitchen_walk_close": ("kitchen_walk_close", ["--no-map"]),
     "kitchen_walk_close, no semantics": ("kitchen_walk_close", ["--semantics", "none", "--no-map"]),
+    "kitchen_walk_close, people": ("kitchen_walk_close", ["--semantics", "people", "--no-map"]),
     "kitchen_walk_close, no semantics, causal masks": (
         "kitchen_walk_close",
         ["--semantics", "none", "--masks", "causal", "--no-map"],
@@ -33,6 +35,7 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "lobby": ("lobby", ["--no-map"]),
     "lobby_walk": ("lobby_walk", ["--no-map"]),
     "lobby_walk, no semantics": ("lobby_walk", ["--semantics", "none", "--no-map"]),
+    "lobby_walk, people": ("lobby_walk", ["--semantics", "people", "--no-map"]),
     "jam": ("jam", ["--no-map"]),
     "tsukuba": ("tsukuba", ["--no-map"]),
     "street, map": ("street", []),
@@ -43,6 +46,9 @@ ENTRIES: dict[str, tuple[str, list[str]]] = {
     "bedroom": ("bedroom", ["--no-map"]),
     "cafe": ("cafe", ["--no-map"]),
     "car": ("car", ["--no-map"]),
+    "cafe, people": ("cafe", ["--semantics", "people", "--no-map"]),
+    "bedroom, people": ("bedroom", ["--semantics", "people", "--no-map"]),
+    "car, people": ("car", ["--semantics", "people", "--no-map"]),
     "car, no semantics": ("car", ["--semantics", "none", "--no-map"]),
 }
 

@@ -43,7 +43,7 @@ def clip(room_clip: Path) -> list[tuple[float, Array]]:
 def whole(room_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> mastd3r.Reconstruction:
     """The clip by the command line."""
     out = tmp_path_factory.mktemp("library") / "run"
-    assert main(["run", str(room_clip), "--out", str(out), "--no-map", "--quiet", "--semantics", "none"]) == 0
+    assert main(["run", str(room_clip), "--out", str(out), "--no-map", "--quiet"]) == 0
     return mastd3r.load(out)
 
 

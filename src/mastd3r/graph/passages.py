@@ -32,10 +32,11 @@ log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
 MOST_POINTS = 300  # of a keyframe, for a decision
 KERNEL_PX = 0.5
-DOUBTFUL = 1.3  # times the median passage's cost a weight: looked at
+LOOKED_AT = 1.1  # times the median passage's cost a weight: another explanation is looked for
+DOUBTFUL = 1.3  # the same: something is wrong there
 MOST_DOUBTED = 6  # passages looked at in one round, the worst first
 ROUNDS = 3
-BETTER = 0.85  # of the cost, for another explanation to be taken
+BETTER = 0.98  # of the cost, for another explanation to be taken
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # the same of the chain, before and after a passage is changed
 LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
@@ -50,7 +51,7 @@ def retake_passages(graph: KeyframeGraph) -> int:
     """
     taken, tried = 0, set[tuple[int, int]]()
     for _ in range(ROUNDS):
-        for ids in doubtful_passages(graph):
+        for ids in doubtful_passages(graph, LOOKED_AT):
             if (ids[0], ids[-1]) in tried:
                 continue
             tried.add((ids[0], ids[-1]))
