@@ -83,6 +83,30 @@ def stress(path: Path, picture: Path) -> list[str]:
     return [*lines, "", *_foot(entries)]
 
 
+def other_options(path: Path) -> list[str]:
+    """Markdown lines of variants run under other options: ATE of each, in the truth's own lengths."""
+    if not path.is_file():
+        return []
+    entries: Entries = list(json.loads(path.read_text()).values())
+    first = entries[0]["configuration"]
+    said = [f"--semantics {first['semantics']}", *(f"--set {o}" for o in first["overrides"])]
+    sequences = list(dict.fromkeys(e["configuration"]["sequence"] for e in entries))
+    lines = [
+        "",
+        f"The same under `{' '.join(said)} --only {','.join(sequences)}` (benchmarks/results/{path.name}), ATE in m:",
+        "",
+        "| sequence | variant | ATE | tracked | keyframes | commit |",
+        "|---|---|---|---|---|---|",
+    ]
+    for e in entries:
+        name, ate = e["configuration"], e.get("ate_rmse_all")
+        cells = [name["sequence"], name["variant"], "none" if ate is None else f"{ate:.4f}"]
+        cells += [f"{e[k]}" if k in e else "–" for k in ("frames_tracked", "keyframes")]
+        lines.append("| " + " | ".join([*cells, str(e["git_commit"])[:12]]) + " |")
+    found = sorted(math.inf if e.get("ate_rmse_all") is None else e["ate_rmse_all"] for e in entries)
+    return [*lines, "", f"Median {_median(found):.4f}, worst {found[-1]:.4f}. {_foot(entries)[-1]}"]
+
+
 def ratio(entry: dict[str, Any]) -> float:
     """ATE over all frames / length of the true path; infinite where there is none."""
     ate, length = entry.get("ate_rmse_all"), entry.get("path_length")

@@ -34,7 +34,7 @@ from profile_table import profile
 from segments_table import segments
 from speed_table import speed
 from splats_table import splats
-from stress_table import PICTURE, stress
+from stress_table import PICTURE, other_options, stress
 from two_videos_table import two_videos
 
 COLUMNS: dict[str, tuple[str, str]] = {
@@ -108,6 +108,7 @@ def main() -> int:
     lines += networks(source.parent / "networks.json")
     lines += masks(source.parent / "masks.json")
     lines += stress(source.parent / "stress.json", target.parent / PICTURE)
+    lines += other_options(source.parent / "stress_people.json")
     lines += fuzz(source.parent / "fuzz.json")
     target.write_text("\n".join(lines).rstrip() + "\n")
     return 0

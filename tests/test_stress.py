@@ -216,6 +216,19 @@ def test_options_that_are_not_the_defaults_are_said(tmp_path: Path) -> None:
     assert "but `--semantics none --set graph.kernel_px=2`" in text and "semantic maps" not in text
 
 
+def test_other_options_have_a_table_of_their_own(tmp_path: Path) -> None:
+    made = {}
+    for variant, ate in (("base", 0.1), ("blur", 0.3), ("noise", None)):
+        entry = stress.Entry("hall", variant, "hall", 0, None, 0, "people", ())
+        record = made_up("hall", variant, 0.1) | {"configuration": entry.identity(), "ate_rmse_all": ate}
+        made[f"hall:{variant}"] = record | {"frames_tracked": 9, "keyframes": 4}
+    (tmp_path / "people.json").write_text(json.dumps(made))
+    lines = stress_table.other_options(tmp_path / "people.json")
+    assert "`--semantics people --only hall`" in lines[1] and "| hall | blur | 0.3000 | 9 | 4 |" in "\n".join(lines)
+    assert "| hall | noise | none | 9 | 4 |" in "\n".join(lines) and "Median 0.3000, worst inf" in lines[-1]
+    assert stress_table.other_options(tmp_path / "none.json") == []
+
+
 def test_the_curve_rises_where_the_errors_are(tmp_path: Path) -> None:
     """From the left of the picture to the right, the curve of all runs climbs to the share that has a path."""
     stress_table.draw(list(ENTRIES.values()), tmp_path / "curve.png")
