@@ -233,10 +233,12 @@ class Slam:
         self.keyframes.finish(self.state)
         for submap in sorted(graph.started):
             graph.submap = submap
-            retake_passages(graph)
+            tried = set[tuple[int, int, int]]()
+            retake_passages(graph, tried)
             if self.config.graph.loops:
                 close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
+            retake_passages(graph, tried)  # more is matched now, which one explanation may fit and another not
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)
         self.masks.close()
         self.keyframes.close()

@@ -43,18 +43,20 @@ LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passa
 DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
 
 
-def retake_passages(graph: KeyframeGraph) -> int:
+def retake_passages(graph: KeyframeGraph, tried: set[tuple[int, int, int]] | None = None) -> int:
     """Try other explanations of badly explained passages of the submap being tracked; how many were taken.
 
+    ``tried``: first and last keyframe and edges of passages that are not tried again; those that are tried are added.
     One is taken where it costs less than ``BETTER`` of what the passage does, on matches of the passage alone, and
     where it lowers the cost of the whole chain too.
     """
-    taken, tried = 0, set[tuple[int, int]]()
+    taken, tried = 0, set[tuple[int, int, int]]() if tried is None else tried
     for _ in range(ROUNDS):
         for ids in doubtful_passages(graph, LOOKED_AT):
-            if (ids[0], ids[-1]) in tried:
+            key = (ids[0], ids[-1], len(graph.edges_among(ids)))
+            if key in tried:
                 continue
-            tried.add((ids[0], ids[-1]))
+            tried.add(key)
             if _retake(graph, ids):
                 taken += 1
                 break  # the passages beside it have changed
