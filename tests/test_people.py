@@ -97,7 +97,8 @@ def test_a_wide_and_a_tall_image_keep_their_proportions(network: PeopleNetwork) 
     tall = network(np.concatenate([figure()[:128], figure()]))
     assert tall.shape == (384, 256)
     assert network(figure()).shape == (256, 256)
-    assert network(np.zeros((30, 3000, 3), np.uint8)).shape == (256, 25600)
+    assert network(np.zeros((30, 240, 3), np.uint8)).shape == (256, 2048)
+    assert not network(np.zeros((2, 3000, 3), np.uint8)).any()
 
 
 def nchw(image: Array) -> torch.Tensor:
