@@ -132,8 +132,8 @@ class DynamicsModel(Protocol):
 class SemanticPrior(Protocol):
     """P(movable) of a frame, from whatever knows it. Built with (config, source).
 
-    It may have ``shows_all``, False where what it does not show may move all the same, and ``memory`` and ``remember``
-    for what it carries from frame to frame.
+    It may have ``shows_all``, False where what it does not show may move all the same, and ``memory``, ``remember``
+    and ``forget`` for what it carries from frame to frame.
     """
 
     notes: tuple[str, ...]

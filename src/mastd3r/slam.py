@@ -243,6 +243,7 @@ class Slam:
         self.masks.close()
         self.keyframes.close()
         getattr(self.parts.features, "forget", lambda: None)()  # nobody asks any more
+        getattr(self.parts.semantics, "forget", lambda: None)()  # the video is read from its beginning again
         give_back_memory()
 
     def prefetched(self, photographs: Iterator[Frame]) -> Iterator[Frame]:

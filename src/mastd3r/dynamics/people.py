@@ -87,6 +87,11 @@ class PeoplePrior:
         with self._one_at_a_time:
             self._looks.extend(memory)
 
+    def forget(self) -> None:
+        """The next frame is the first of a video."""
+        with self._one_at_a_time:
+            self._looks.clear()
+
     def _due(self, time_s: float) -> bool:
         last = max((look for look in self._looks if look[0] < time_s), default=None)
         return last is None or last[1] or time_s - last[0] > AGAIN_S - TOLERANCE_S
