@@ -388,3 +388,11 @@ def test_an_earlier_run_may_be_overwritten_and_evaluated(mastd3r: Command, room_
 def test_doctor_says_what_would_be_chosen(mastd3r: Command) -> None:
     said = mastd3r("doctor", run=False)
     assert said.code == 0 and "geometric" in said.out and "keyframe_motion_ratio" in said.out
+
+
+def test_a_path_that_a_terminal_must_not_get_is_refused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "a\x1b[2Jb.pth"
+    file.write_bytes(b"x")
+    assert main(["weights", "path", str(file)]) == 2
+    said = capfd.readouterr()
+    assert not said.out and len(said.err.splitlines()) == 1 and r"a\x1b[2Jb.pth" in said.err

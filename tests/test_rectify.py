@@ -212,6 +212,7 @@ def test_a_photograph_survives_the_map_s_pinhole(name: str) -> None:
         ("150,150,80,60,0.5,-4,0,0", ["folds inside"]),
         ("150,150,80,60,0,0,0.8,0.8", ["folds inside"]),
         ("150,150,80,60,0,0,0,0,0,3,0,0", ["folds inside"]),
+        ("1e308,100,100,100,100,1e308,50,1e308", ["folds inside"]),
         ("150,150,9000,60,0.00001", ["--intrinsics"]),
         ("150,150,80,60,a", ["expected fx,fy,cx,cy", "'150,150,80,60,a'"]),
     ],

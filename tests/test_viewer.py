@@ -23,7 +23,7 @@ from mastd3r.camera.pinhole import Camera
 from mastd3r.cli import view as command
 from mastd3r.cli.main import main
 from mastd3r.config import SourceConfig
-from mastd3r.errors import InputError
+from mastd3r.errors import ConfigError, InputError
 from mastd3r.export.dense_files import write_dense_cloud
 from mastd3r.export.mesh_files import read_mesh, write_mesh
 from mastd3r.export.read_run import read_run
@@ -371,6 +371,19 @@ def test_ctrl_c_ends_it_cleanly(run: Path) -> None:
     assert process.returncode == 130 and rest == ""
     assert said.splitlines()[-1] == "mastd3r: stopped; the run is as it was"
     assert "Traceback" not in said
+
+
+def test_a_name_that_is_not_known_is_asked_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def unknown(host: str, *_: Any, **__: Any) -> Any:
+        asked.append(host)
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(socket, "getaddrinfo", unknown)
+    with pytest.raises(ConfigError, match="--host con: expected the name or address of this machine, got name or serv"):
+        free_port("con")
+    assert asked == ["con"]
 
 
 @pytest.mark.parametrize("host", ["x\x9by", "a" * 70, "..", "\ud800"])

@@ -89,7 +89,10 @@ class OpenCvLens:
         if not self.distorted:
             return True
         x, y = np.linspace(-0.5, self.width - 0.5, 65), np.linspace(-0.5, self.height - 0.5, 49)
-        return bool(np.isfinite(self.rays(np.stack(np.meshgrid(x, y), -1))).all())
+        with np.errstate(all="ignore"):  # numbers that nobody can count with end as no number, and are refused so
+            if not len(self._radii[0]):
+                return False
+            return bool(np.isfinite(self.rays(np.stack(np.meshgrid(x, y), -1))).all())
 
     @property
     def _focals(self) -> Array:

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ..errors import ConfigError, InputError
 from ..reading.files import is_dir
-from .screen import screen
+from .screen import plain, screen
 
 if TYPE_CHECKING:
     from ..download.weights_download import Accept
@@ -113,5 +113,8 @@ def _check(args: argparse.Namespace, console: Console) -> int:
 def _path(args: argparse.Namespace, console: Console) -> int:
     from ..download.weights import path
 
-    print(path(args.what))
+    found = str(path(args.what))
+    if not found.isprintable():  # a script needs it as it is, a terminal must not get it so
+        raise InputError(f"weights path: expected a path of printable characters, got {plain(found)}")
+    print(found)
     return 0

@@ -61,6 +61,11 @@ def address(server: ViserServer) -> str:
 def free_port(host: str) -> int:
     """The first port from 8080 on that can be served on. Raises ConfigError."""
     why: str | None = "none"
+    try:
+        socket.getaddrinfo(host, FIRST_PORT, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as e:  # a name server may take its time, and would be asked for every port
+        reason = str(getattr(e, "strerror", None) or "a name that no host can have").lower()
+        raise ConfigError(f"--host {host}: expected the name or address of this machine, got {reason}") from e
     for port in range(FIRST_PORT, FIRST_PORT + PORTS):
         why = refused(host, port)
         if why is None:
