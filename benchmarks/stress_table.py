@@ -66,6 +66,10 @@ def stress(path: Path, picture: Path) -> list[str]:
     missing = [name for name in SEQUENCES if not any(e["configuration"]["sequence"] == name for e in entries)]
     if missing:
         head += f"\nNot run, and so in none of these figures: {', '.join(missing)}.\n"
+    priors = ("semantics: people", "semantics: maps", "semantics: dinov2")
+    bare = sum(not any(c.startswith(priors) for c in e.get("choices", ())) for e in entries)
+    if bare and first["semantics"] == "auto":
+        head += f"\n{bare} runs are of commits that looked for no people where a sequence brings no maps.\n"
     lines = [*head.splitlines(), "", f"![share of runs below an error]({picture.name})", ""]
     lines += ["| ATE at most, of the path | " + " | ".join(f"{100 * s:g} %" for s in SHARES) + " |"]
     lines.append("|---" * (len(SHARES) + 1) + "|")
