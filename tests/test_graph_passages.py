@@ -130,3 +130,27 @@ def test_measured_depths_have_a_scale_that_is_not_ours_to_change(exact_scene: Ca
     for v in graph.variables.values():
         v.prior_info = 100.0 / np.maximum(v.inv_depth, 1e-3) ** 2
     assert graph.depths_measured and doubtful_passages(graph) == [] and retake_passages(graph) == 0
+
+
+def test_a_passage_is_tried_again_only_once_it_has_more_matches(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Graph:
+        edges: tuple[int, ...] = (1, 2)
+
+        def edges_among(self, ids: list[int]) -> tuple[int, ...]:
+            return self.edges
+
+    bounds, retaken, graph = list[float](), list[list[int]](), Graph()
+
+    def doubtful(_: Any, times: float) -> list[list[int]]:
+        bounds.append(times)
+        return [[3, 4]]
+
+    monkeypatch.setattr(passages_module, "doubtful_passages", doubtful)
+    monkeypatch.setattr(passages_module, "_retake", lambda _, ids: bool(retaken.append(ids)))
+    tried = set[tuple[int, int, int]]()
+    retake_passages(graph, tried)  # type: ignore[arg-type]
+    retake_passages(graph, tried)  # type: ignore[arg-type]
+    assert len(retaken) == 1 and set(bounds) == {passages_module.LOOKED_AT}
+    graph.edges = (1, 2, 3)
+    retake_passages(graph, tried)  # type: ignore[arg-type]
+    assert len(retaken) == 2

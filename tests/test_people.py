@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,18 @@ from torch.nn import functional
 
 from helpers import data_path
 from mastd3r.config import Config
-from mastd3r.dynamics.config import DynamicsConfig, SemanticConfig
+from mastd3r.dynamics.config import DynamicsConfig, RefinementConfig, SemanticConfig
+from mastd3r.dynamics.fusion import shown_mask
 from mastd3r.dynamics.people import AGAIN_S, PeoplePrior, without_still
 from mastd3r.dynamics.refinement import EdgeRefinement
 from mastd3r.errors import InputError
 from mastd3r.networks import people_kernels
 from mastd3r.networks.people import WEIGHTS, PeopleNetwork
 from mastd3r.parts import build_parts, parts_of
+from mastd3r.slam import Slam
+from mastd3r.tracking.memory import remember
 from mastd3r.types import Frame
+from test_dynamics_filter import frame, input_of
 from test_parts import Clip
 
 Array = NDArray[Any]
@@ -201,8 +206,8 @@ def test_it_looks_at_every_frame_while_somebody_is_there_and_four_a_second_else(
 def test_slow_frames_are_all_looked_at() -> None:
     network = Counting()
     prior = PeoplePrior(network, "")
-    for frame in clip("....x...", fps=1.5):
-        prior.fill(frame)
+    for one in clip("....x...", fps=1.5):
+        prior.fill(one)
     assert network.asked == list(range(8))
 
 
@@ -211,19 +216,19 @@ def test_it_looks_at_the_same_frames_after_a_stop(stopped: int) -> None:
     whole, first, rest = Counting(), Counting(), Counting()
     frames = list(clip(".....xx.......x.........."))
     a, b, c = (PeoplePrior(n, "") for n in (whole, first, rest))
-    for frame in frames:
-        a.fill(frame)
-    for frame in frames[: stopped + 1]:  # one frame was looked at before its turn
-        b.fill(frame)
+    for one in frames:
+        a.fill(one)
+    for one in frames[: stopped + 1]:  # one frame was looked at before its turn
+        b.fill(one)
     c.remember(b.memory())
-    for frame in frames[stopped:]:
-        c.fill(frame)
+    for one in frames[stopped:]:
+        c.fill(one)
     assert sorted({*first.asked, *rest.asked}) == whole.asked
     again = Counting()
     d = PeoplePrior(again, "")
     for _ in range(2):  # the smoothing pass reads the video once more
-        for frame in frames:
-            d.fill(frame)
+        for one in frames:
+            d.fill(one)
         d.fill(frames[stopped])  # a lost frame is looked for after the last one
         d.forget()
     assert [a for a in again.asked if a != stopped] == [a for a in 2 * whole.asked if a != stopped]
@@ -250,6 +255,33 @@ def test_the_model_is_told_that_people_are_not_all_that_moves() -> None:
     assert not parts.dynamics.filter(64, 48).config.semantic.shows_all  # type: ignore[attr-defined]
     plain = parts_of(parts.provider, Config(features="orb"))
     assert plain.dynamics.filter(64, 48).config.semantic.shows_all  # type: ignore[attr-defined]
+
+
+def test_a_figure_that_stands_is_in_no_mask_and_one_that_stirs_is() -> None:
+    """What the mask shows, not the map alone: half of the figure has no texture to be seen by."""
+    config = DynamicsConfig(semantic=SemanticConfig(shows_all=False), refinement=RefinementConfig(enabled=False))
+    given = input_of(0, *frame(0, 3.0)[:2])
+    height, width = given.gray.shape
+    shown, evidence = np.zeros((height, width), np.float32), np.zeros((height // 2, width // 2), np.float32)
+    figure_at, bare = np.s_[60:180, 80:200], np.s_[70:110, 90:190]
+    shown[figure_at] = 1
+    evidence[60:90, 40:100] = -3
+    refinement = EdgeRefinement(config, width, height)
+    standing = shown_mask(refinement, evidence, replace(given, semantic=shown), None, {}).probability
+    evidence[80:84, 40:100] = 3
+    stirring = shown_mask(refinement, evidence, replace(given, semantic=shown), None, {}).probability
+    assert standing[bare].max() < 0.2 and stirring[bare].min() > 0.7
+
+
+def test_where_it_looked_is_part_of_what_tracking_remembers() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)
+    config = Config(semantics="people", mapping=replace(Config().mapping, enabled=False))
+    first, second = (Slam(config, (160, 120)) for _ in range(2))
+    first.track(image, 0.5)
+    kept = first.memory()
+    assert kept.semantics == ((0.5, False),)
+    remember(kept, second.keyframes, second.masks, second.parts)
+    assert second.parts.semantics.memory() == kept.semantics  # type: ignore[attr-defined]
 
 
 # -- real photographs --------------------------------------------------------------------------------------------

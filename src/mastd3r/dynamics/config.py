@@ -72,9 +72,13 @@ class SemanticConfig:
     shows_all: bool = True  # False: it shows some of what can move (people), and where it shows nothing it says nothing
     most_partial: Annotated[float, Range(0.5, 0.99)] = 0.8  # such a map is never believed beyond this
 
+    def outlines(self, semantic: object) -> bool:
+        """Whether there is a map, and one that says where all that can move ends."""
+        return semantic is not None and self.enabled and self.shows_all
+
     def share_beside(self, semantic: object) -> float:
         """Weight of our evidence beside a map, or beside none."""
-        return self.evidence_share if semantic is not None and self.enabled and self.shows_all else 1.0
+        return self.evidence_share if self.outlines(semantic) else 1.0
 
 
 @dataclass(frozen=True)

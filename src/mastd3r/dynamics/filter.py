@@ -18,7 +18,7 @@ from .flow import HalfFlow
 from .fusion import accumulated, alike, carried_along, kept_share, resized, shown_mask, with_depth
 from .motion import Information, texture_information
 from .motion_test import MotionTest, Past
-from .people import without_still
+from .people import believed
 from .photometric import photo_variance
 from .refinement import EdgeRefinement, sigmoid
 
@@ -76,8 +76,7 @@ class LogOddsFilter:
         if arrival.appearance is not None:
             log_odds = log_odds + self.config.appearance.share * resized(arrival.appearance, log_odds.shape)
         share = self.config.semantic.share_beside(semantic)
-        if semantic is not None and not self.config.semantic.shows_all:
-            semantic = without_still(semantic, arrival.carried)
+        semantic = believed(semantic, arrival.carried, self.config.semantic)
         return sigmoid(share * refinement.full(log_odds) + refinement.semantic_log_odds(semantic))
 
     def update(self, frame: DynamicsInput) -> DynamicMask:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from .config import DynamicsConfig
 from .data import DynamicMask, DynamicsInput
-from .people import without_still
+from .people import believed
 from .pixels import JIT, between_pixels
 from .refinement import EdgeRefinement
 
@@ -122,8 +122,7 @@ def shown_mask(
     refinement: EdgeRefinement, log_odds: Array, frame: DynamicsInput, appearance: Array | None, terms: dict[str, Array]
 ) -> DynamicMask:
     """The mask of log-odds at half size, with the semantics and the appearance that the frame has."""
-    if frame.semantic is not None and not refinement.config.semantic.shows_all:
-        frame = replace(frame, semantic=without_still(frame.semantic, log_odds))
+    frame = replace(frame, semantic=believed(frame.semantic, log_odds, refinement.config.semantic))
     p = refinement.probability(log_odds, frame, appearance, terms.get("depth"))
     if frame.semantic is not None and refinement.config.semantic.enabled:
         terms["semantic"] = refinement.semantic_log_odds(frame.semantic)

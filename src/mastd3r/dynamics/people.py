@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..types import Frame
+from .config import SemanticConfig
 
 Array = NDArray[Any]
 UNSURE = 1.0  # log-odds of the evidence below which it says nothing, either way
@@ -21,6 +22,11 @@ AGAIN_S = 0.25  # where nobody was seen, after which people are looked for again
 TOLERANCE_S = 1e-6  # of times, which are sums
 SOMEBODY = 0.005  # share of the image that is a person with P > 0.5, below: nobody is seen
 REMEMBERED = 8  # frames that were looked at
+
+
+def believed(semantic: Array | None, log_odds: Array, config: SemanticConfig) -> Array | None:
+    """A map (h, w) as it is believed beside the evidence: one that shows people only, without those who stand still."""
+    return semantic if semantic is None or config.shows_all else without_still(semantic, log_odds)
 
 
 def without_still(shown: Array, log_odds: Array) -> Array:

@@ -38,7 +38,7 @@ class EdgeRefinement:
             log_odds = log_odds + c.appearance.share * alike
             log_odds = np.clip(log_odds, -c.max_log_odds, c.max_log_odds)
         shown = self.regions(log_odds, frame, sharp)
-        joined = semantic is not None and c.semantic.enabled and c.semantic.shows_all
+        joined = c.semantic.outlines(semantic)
         shown = c.semantic.share_beside(semantic) * shown + self.semantic_log_odds(semantic)
         if joined and c.refinement.enabled:
             shown = self._fine(shown, frame, c.refinement.fine_contrast_semantic)

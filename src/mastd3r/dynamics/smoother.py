@@ -19,7 +19,7 @@ from .flow import HalfFlow
 from .fusion import accumulated, alike, carried_along, kept_share, shown_mask, with_depth
 from .motion import texture_information
 from .motion_test import Aligned, MotionTest, Past, Present
-from .people import without_still
+from .people import believed
 from .photometric import photo_variance
 from .refinement import EdgeRefinement, sigmoid
 
@@ -194,7 +194,5 @@ class ForwardBackwardSmoother:
         semantic, c = frame.input.semantic, self.config
         if semantic is None or not c.semantic.enabled:
             return sigmoid(log_odds + np.float32(np.log(c.base_rate / (1 - c.base_rate))))
-        if not c.semantic.shows_all:
-            semantic = without_still(semantic, log_odds)
-        prior = self.refinement.shrink(self.refinement.semantic_log_odds(semantic))
-        return sigmoid(c.semantic.share_beside(semantic) * log_odds + prior)
+        prior = self.refinement.semantic_log_odds(believed(semantic, log_odds, c.semantic))
+        return sigmoid(c.semantic.share_beside(semantic) * log_odds + self.refinement.shrink(prior))
