@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,12 +17,22 @@ from ..types import Frame
 from .config import SemanticConfig
 
 Array = NDArray[Any]
+Looks = tuple[tuple[float, bool], ...]  # time, and whether somebody was seen
+Turns = tuple[int, tuple[tuple[float, tuple[float, ...], tuple[float, ...]], ...]]  # first; time, shares by turn
+log = logging.getLogger(__name__)
 UNSURE = 1.0  # log-odds of the evidence below which it says nothing, either way
 STILL_SHARE, MOVING_SHARE = 0.3, 0.03  # of a figure, that is seen to stand still, at least, and to move, at most
 AGAIN_S = 0.25  # where nobody was seen, after which people are looked for again
 TOLERANCE_S = 1e-6  # of times, which are sums
 SOMEBODY = 0.005  # share of the image that is a person with P > 0.5, below: nobody is seen
 REMEMBERED = 8  # frames that were looked at
+TURN_AGAIN_S, TURN_SOON_S = 1.0, 0.25  # after which it is found again which way up people are; at first
+TURNS_REMEMBERED, TURNS_SOON = 32, 16  # times that this was found; that it is found soon again
+LEAST_TURNS = 8  # times that somebody was perhaps seen, before a turn is believed
+SURELY, PERHAPS = 0.9, 0.1  # P(person): people the right way up are shown surely, others, and what is none, vaguely
+MOSTLY_SURE = 0.25  # share of what is perhaps people that surely is, below: nobody
+SURE_TURNED = 0.4  # the same of a turn, below: it is not believed
+BETTER_TURNED = 1.2  # times that share of the picture as it is, for a turn to be taken
 
 
 def believed(semantic: Array | None, log_odds: Array, config: SemanticConfig) -> Array | None:
@@ -57,7 +68,9 @@ def without_still(shown: Array, log_odds: Array) -> Array:
 class PeoplePrior:
     """Fills frames with P(person), every frame while somebody is in sight, else four a second.
 
-    Whether a frame is looked at depends on its time and on the looks before it, not on who asks or how often.
+    A network that has learned from people who stand does not know them in pictures that lie on their side, as of a
+    camera that was held or built in so. Once a second a picture is shown to it in all four turns.
+    Whether a frame is looked at, and how, depends on its time and on the looks before it, not on who asks or how often.
     """
 
     shows_all = False  # of what can move: people only
@@ -67,37 +80,117 @@ class PeoplePrior:
         self.notes = (note,)
         self._network = network
         self._looks: deque[tuple[float, bool]] = deque(maxlen=REMEMBERED)  # time, and whether somebody was seen
+        self._turns = _Turns()
         self._one_at_a_time = threading.Lock()
 
     def fill(self, frame: Frame) -> Frame:
         """The frame with P(person) as its semantic map, or as it is where nobody is seen or looked for."""
+        time_s = frame.timestamp_s
         with self._one_at_a_time:
-            if not self._due(frame.timestamp_s):
+            if not self._due(time_s):
                 return frame
-            found = self._network(frame.image)
-            somebody = bool(np.count_nonzero(found > 0.5) >= SOMEBODY * found.size)
-            self._looks.append((frame.timestamp_s, somebody))
+            if self._turns.due(time_s):
+                maps = [self._seen(frame.image, quarter) for quarter in range(4)]
+                self._turns.compare(time_s, maps)
+                found = maps[self._turns.quarter(time_s)]
+            else:
+                found = self._seen(frame.image, self._turns.quarter(time_s))
+            somebody = self._turns.believed(time_s, found)
+            self._looks.append((time_s, somebody))
         return replace(frame, semantic=found) if somebody else frame
 
     def features(self, frame: Frame) -> None:
         """None: descriptors are made of the image."""
         return
 
-    def memory(self) -> tuple[tuple[float, bool], ...]:
-        """What decides where it looks next."""
+    def memory(self) -> tuple[Looks, Turns]:
+        """What decides where it looks next, and which way up."""
         with self._one_at_a_time:
-            return tuple(self._looks)
+            return tuple(self._looks), self._turns.memory()
 
-    def remember(self, memory: tuple[tuple[float, bool], ...]) -> None:
+    def remember(self, memory: tuple[Looks, Turns]) -> None:
         """What ``memory`` gave."""
         with self._one_at_a_time:
-            self._looks.extend(memory)
+            self._looks.extend(memory[0])
+            self._turns.remember(memory[1])
 
     def forget(self) -> None:
-        """The next frame is the first of a video."""
+        """The next frame is the first of the same video; the way up that was found last is where it begins."""
         with self._one_at_a_time:
             self._looks.clear()
+            self._turns = _Turns(self._turns.quarter(np.inf))
 
     def _due(self, time_s: float) -> bool:
         last = max((look for look in self._looks if look[0] < time_s), default=None)
         return last is None or last[1] or time_s - last[0] > AGAIN_S - TOLERANCE_S
+
+    def _seen(self, image: Array, quarter: int) -> Array:
+        """P(person) by the network, of the image turned by ``quarter`` times 90 degrees, turned back."""
+        found = self._network(np.ascontiguousarray(np.rot90(image, quarter)))
+        return np.ascontiguousarray(np.rot90(found, -quarter))
+
+
+class _Turns:
+    """Which way up people are: the turn in which most of what is perhaps people surely is, over the last times."""
+
+    def __init__(self, first: int = 0) -> None:
+        """``first``: the turn that is taken until there is enough to tell."""
+        self._shares: dict[float, tuple[Array, Array]] = {}  # by time: surely, and perhaps people, of each turn (4,)
+        self._first = self._said = first
+
+    def due(self, time_s: float) -> bool:
+        """Whether it is to be found again at a time."""
+        before = [t for t in self._shares if t < time_s]
+        again_s = TURN_AGAIN_S if len(before) >= TURNS_SOON else TURN_SOON_S
+        return not before or time_s - max(before) > again_s - TOLERANCE_S
+
+    def compare(self, time_s: float, maps: Sequence[Array]) -> None:
+        """Add what the network shows of the four turns of one image."""
+        surely, perhaps = np.array([_shares(m) for m in maps]).T
+        self._shares[time_s] = surely, perhaps
+        for old in sorted(self._shares)[:-TURNS_REMEMBERED]:
+            del self._shares[old]
+        quarter = self.quarter(time_s)
+        if quarter != self._said:
+            self._said = quarter
+            log.info("from %.2f s on people are looked for in images turned by %d degrees", time_s, 90 * quarter)
+
+    def quarter(self, time_s: float) -> int:
+        """How many quarters of a turn, counterclockwise, stand people up, as known until ``time_s``."""
+        surely, perhaps, times = self._until(time_s)
+        sure = surely / perhaps
+        best = int(np.argmax(sure))
+        if times < LEAST_TURNS or sure[best] < SURE_TURNED:
+            return self._first
+        return best if sure[best] > BETTER_TURNED * sure[0] else 0
+
+    def believed(self, time_s: float, found: Array) -> bool:
+        """Whether a map of the turn taken at a time shows somebody, by itself or by what was seen until then."""
+        if np.count_nonzero(found > 0.5) < SOMEBODY * found.size:
+            return False
+        surely, perhaps, _ = self._until(time_s)
+        quarter = self.quarter(time_s)
+        own_surely, own_perhaps = _shares(found)
+        return own_surely >= MOSTLY_SURE * own_perhaps or bool(surely[quarter] >= MOSTLY_SURE * perhaps[quarter])
+
+    def _until(self, time_s: float) -> tuple[Array, Array, int]:
+        """Surely and perhaps people by turn, (4,) each, and how often somebody was perhaps seen, until a time."""
+        until = [shares for t, shares in self._shares.items() if t <= time_s]
+        surely, perhaps = np.sum(until, axis=0) if until else np.zeros((2, 4))
+        return surely, np.maximum(perhaps, SOMEBODY), sum(bool(p.max() >= SOMEBODY) for _, p in until)
+
+    def memory(self) -> Turns:
+        """What was found when, as numbers."""
+        found = tuple((t, tuple(s.tolist()), tuple(p.tolist())) for t, (s, p) in self._shares.items())
+        return self._first, found
+
+    def remember(self, memory: Turns) -> None:
+        """What ``memory`` gave."""
+        self._first, found = memory
+        self._shares = {t: (np.array(s), np.array(p)) for t, s, p in found}
+        self._said = self.quarter(np.inf)
+
+
+def _shares(found: Array) -> tuple[float, float]:
+    """Shares of an image that are surely and perhaps people."""
+    return float((found > SURELY).mean()), float((found > PERHAPS).mean())
