@@ -23,6 +23,7 @@ from .export.run_folder import RunFolder
 from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
+from .graph.loose import leave_loose
 from .graph.merging import with_lost_frames
 from .graph.passages import retake_passages
 from .metric.measure import measure
@@ -226,7 +227,10 @@ class Slam:
         return joints
 
     def end_tracking(self) -> None:
-        """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched."""
+        """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched.
+
+        What hangs by a thread goes, and lost frames are looked for among the keyframes that stay.
+        """
         self._refuse_if_ended("finish")
         self._ended = True
         graph = self.graph
@@ -239,6 +243,7 @@ class Slam:
                 close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
             retake_passages(graph, tried)  # more is matched now, which one explanation may fit and another not
+            leave_loose(graph)
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)
         self.masks.close()
         self.keyframes.close()

@@ -139,13 +139,7 @@ class KeyframeGraph:
         self.intrinsics = believing(self.intrinsics, focal_px, self.size)
 
     def add_keyframe(
-        self,
-        work: WorkFrame,
-        static: Array,
-        moving: Array,
-        cam_from_world: Array,
-        inv_depth: Array,
-        prior_info: Array,
+        self, work: WorkFrame, static: Array, moving: Array, cam_from_world: Array, inv_depth: Array, prior_info: Array
     ) -> Keyframe:
         """Store a keyframe with a first pose and first depths (p,); ``prior_info`` (p,) is that of the depths."""
         kf = Keyframe(len(self.keyframes), work, static, np.rint(255 * moving).astype(np.uint8))
@@ -176,13 +170,7 @@ class KeyframeGraph:
         return edge is not None
 
     def record(
-        self,
-        work: WorkFrame,
-        kf_id: int,
-        cam_from_kf: Array,
-        state: State,
-        matches: Matches | None,
-        weight: Array,
+        self, work: WorkFrame, kf_id: int, cam_from_kf: Array, state: State, matches: Matches | None, weight: Array
     ) -> FrameRecord:
         """Store a frame's place; its strongest matches are kept for the final pose."""
         kept = no_matches() if matches is None else strongest(matches, weight)
@@ -208,7 +196,12 @@ class KeyframeGraph:
 
     def drop_submap(self, submap: int | None = None) -> None:
         """Forget the keyframes of a submap, by default of the one being tracked; its frames become lost."""
-        kept = sorted(set(self.variables) - set(self.members(submap)))
+        self.drop_keyframes(self.members(submap))
+        self.started.discard(self.submap if submap is None else submap)
+
+    def drop_keyframes(self, ids: Iterable[int]) -> None:
+        """Forget keyframes; the frames that hang on them become lost. Those that stay are numbered anew."""
+        kept = sorted(set(self.variables) - set(ids))
         new = {k: n for n, k in enumerate(kept)}
         self.keyframes = [replace(self.keyframes[k], id=n) for k, n in new.items()]
         self.edges = [replace(e, i=new[e.i], j=new[e.j]) for e in self.edges if e.i in new and e.j in new]
@@ -218,7 +211,12 @@ class KeyframeGraph:
             if r.kf_id not in new:
                 r.state, r.is_keyframe, (r.points, r.target, r.weight) = "lost", False, no_matches()
             r.kf_id = max(int(np.searchsorted(kept, r.kf_id, "right")) - 1, 0)
-        self.started.discard(self.submap if submap is None else submap)
+
+    def separate(self, ids: Iterable[int], submap: int | None = None) -> None:
+        """Some keyframes of a submap become one of their own, started as it was; ``submap``: its number."""
+        new = 1 + max(self.submap_of.values()) if submap is None else submap
+        self.submap_of.update(dict.fromkeys(ids, new))
+        self.started.add(new)
 
     def part(self) -> KeyframeGraph:
         """The submap being tracked as a graph by itself, sharing keyframes, variables, edges and records."""

@@ -1,0 +1,101 @@
+"""Keyframes that too few matches hold to the rest of their submap: where they are nobody knows.
+
+Where somebody fills the picture, a frame may be followed by a few matches at the outline of what moves. They agree on
+a pose that is off by the length of a step and more. Nothing else sees the frame, so no solve mends it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections import defaultdict
+from collections.abc import Collection
+
+from ..geometry.reprojection_kernels import edge_residuals
+from ..geometry.se3 import inverse
+from .factors import ReprojectionFactor
+from .keyframe_graph import KeyframeGraph
+
+log = logging.getLogger(__name__)
+FIRM = 25.0  # weight of the matches between two parts that agree, either way: from here on their place is known
+AGREES_PX = 3.0  # from where poses and depths put it, for a match to count
+FEW = 8  # keyframes of a part at most, for it to be given up
+
+
+def leave_loose(graph: KeyframeGraph) -> int:
+    """Take the parts of ``loose_parts`` out of the submap being tracked; how many keyframes they had.
+
+    Small ones are forgotten, and the frames that hang on them are lost: others may see them, and they lie between two
+    that are known. Larger ones become submaps of their own.
+    """
+    parts = loose_parts(graph)
+    gone = [k for part in parts if len(part) <= FEW for k in part]
+    for part in (p for p in parts if len(p) > FEW):
+        graph.separate(part)
+        frames = [graph.keyframes[k].work.index for k in (part[0], part[-1])]
+        log.info("frames %d to %d: next to nothing holds them to the rest, they are a piece apart", *frames)
+    if gone:
+        frames = [graph.keyframes[k].work.index for k in gone]
+        log.info("keyframes at frames %s hang by a thread, and are left out", ", ".join(map(str, sorted(frames))))
+        graph.drop_keyframes(gone)
+    return sum(map(len, parts))
+
+
+def loose_parts(graph: KeyframeGraph) -> list[list[int]]:
+    """Parts of the submap being tracked, all but the largest, that no firm link holds to any other.
+
+    A small part that others hang on stays: a thread is more than nothing there. So does what has a part of a saved map.
+    """
+    members = graph.members()
+    weights: dict[frozenset[int], float] = defaultdict(float)
+    for e in graph.edges_among(members):
+        weights[frozenset((e.i, e.j))] += _agreeing_weight(graph, e)
+    parts = sorted(firm_parts(members, weights), key=len)
+    any_link = dict.fromkeys(weights, 1.0)
+    loose: list[list[int]] = []
+    rest = set(members)
+    for part in parts[:-1]:
+        without = rest - part
+        alone = len(firm_parts(without, any_link, 1.0)) <= len(firm_parts(rest, any_link, 1.0))
+        if all(k >= graph.held for k in part) and (alone or len(part) > FEW):
+            loose.append(sorted(part))
+            rest = without
+    return loose
+
+
+def _agreeing_weight(graph: KeyframeGraph, edge: ReprojectionFactor) -> float:
+    """Weight of the matches of an edge that are where poses and depths put them."""
+    v = graph.variables[edge.i]
+    j_from_i = graph.variables[edge.j].cam_from_world @ inverse(v.cam_from_world)
+    off, _ = edge_residuals(v.px, v.inv_depth, edge.target.astype(float), j_from_i, graph.intrinsics.values)
+    return float(edge.weight[(off**2).sum(1) < AGREES_PX**2].sum())
+
+
+def firm_parts(ids: Collection[int], weights: dict[frozenset[int], float], least: float = FIRM) -> list[frozenset[int]]:
+    """Sets of ``ids`` between any two of which matches weigh less than ``least``, all together.
+
+    ``weights``: of pairs. Two sets of which each is held weakly to the other by many pairs are one.
+    """
+    part_of = {k: k for k in ids}
+
+    def root(k: int) -> int:
+        while part_of[k] != k:
+            part_of[k] = part_of[part_of[k]]
+            k = part_of[k]
+        return k
+
+    inside = [(tuple(pair), w) for pair, w in weights.items() if len(pair) == 2 and pair <= part_of.keys()]
+    while True:
+        between: dict[tuple[int, int], float] = defaultdict(float)
+        for (i, j), w in inside:
+            a, b = sorted((root(i), root(j)))
+            if a != b:
+                between[a, b] += w
+        firm = [pair for pair, w in between.items() if w >= least]
+        if not firm:
+            break
+        for a, b in firm:
+            part_of[root(a)] = root(b)
+    parts: dict[int, set[int]] = defaultdict(set)
+    for k in ids:
+        parts[root(k)].add(k)
+    return [frozenset(p) for p in parts.values()]
