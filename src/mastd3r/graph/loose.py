@@ -53,13 +53,15 @@ def loose_parts(graph: KeyframeGraph) -> list[list[int]]:
     any_link = dict.fromkeys(weights, 1.0)
     loose: list[list[int]] = []
     rest = set(members)
-    for part in parts[:-1]:
-        without = rest - part
-        alone = len(firm_parts(without, any_link, 1.0)) <= len(firm_parts(rest, any_link, 1.0))
-        if all(k >= graph.held for k in part) and (alone or len(part) > FEW):
-            loose.append(sorted(part))
-            rest = without
-    return loose
+    while True:
+        whole = len(firm_parts(rest, any_link, 1.0))
+        for part in (p for p in parts[:-1] if p <= rest and all(k >= graph.held for k in p)):
+            if len(part) > FEW or len(firm_parts(rest - part, any_link, 1.0)) <= whole:
+                loose.append(sorted(part))
+                rest -= part
+                break  # what hung on it may go now
+        else:
+            return loose
 
 
 def _agreeing_weight(graph: KeyframeGraph, edge: ReprojectionFactor) -> float:

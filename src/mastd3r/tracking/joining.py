@@ -34,7 +34,7 @@ def join_recognised(
     two together, and two places that look alike are not one.
     ``unscaled`` takes the views of such places whose scale is not known: too few points have a depth on both sides.
     """
-    own = graph.submap_of[kf.id]
+    own, tracked = graph.submap_of[kf.id], graph.submap
     for view in _seen_elsewhere(graph, kf, two_view, places, entry):
         other, pose = view.anchor, view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
@@ -51,7 +51,7 @@ def join_recognised(
         if len(graph.edges) == count and not graph.held:
             log.info("submap %d is apart again: nothing around keyframe %d matches", own, other.id)
             graph.separate(moved, own)
-            graph.submap = own
+            graph.submap = tracked
             continue
         graph.solve_all(10, 2.0)
         return True
