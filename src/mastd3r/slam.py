@@ -26,6 +26,7 @@ from .graph.keyframe_graph import KeyframeGraph
 from .graph.loose import leave_loose
 from .graph.merging import with_lost_frames
 from .graph.passages import retake_passages
+from .graph.scale_jumps import mend_scale_jumps
 from .metric.measure import measure
 from .offline.checkpoints import Checkpoints, Memory
 from .offline.extended_map import ExtendedMap
@@ -229,7 +230,8 @@ class Slam:
     def end_tracking(self) -> None:
         """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched.
 
-        What hangs by a thread goes, and lost frames are looked for among the keyframes that stay.
+        Jumps of scale are mended where that is cheaper, before others are matched by it, and again. What hangs by a
+        thread goes, and lost frames are looked for among the keyframes that stay.
         """
         self._refuse_if_ended("finish")
         self._ended = True
@@ -239,11 +241,13 @@ class Slam:
             graph.submap = submap
             tried = set[tuple[int, int, int]]()
             retake_passages(graph, tried)
+            mend_scale_jumps(graph)
             if self.config.graph.loops:
                 close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
             retake_passages(graph, tried)  # more is matched now, which one explanation may fit and another not
             leave_loose(graph)
+            mend_scale_jumps(graph)
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)
         self.masks.close()
         self.keyframes.close()

@@ -105,14 +105,14 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
             continue
         found = solved(part, SETTLING)
         if found < BETTER * cost:
-            best = found, _state(part)
+            best = found, state_of(part)
     frames = [graph.keyframes[k].work.index for k in (ids[0], ids[-1])]
     if best is None:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
-    before, kept, lens = _cost_around(graph, ids), _state(graph), graph.intrinsics
+    before, kept, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
     replace_passage(graph, ids, best[1])
-    after = _cost_around(graph, ids)
+    after = cost_around(graph, ids)
     if after < before:
         log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
                  before, after)  # fmt: skip
@@ -176,7 +176,7 @@ def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     return cost
 
 
-def _cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
+def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     """What the whole chain costs once it is solved; of a long one the keyframes around a passage.
 
     Those before stay where they are, those after come along.
@@ -195,7 +195,7 @@ def _cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     return cost
 
 
-def _state(graph: KeyframeGraph) -> State:
+def state_of(graph: KeyframeGraph) -> State:
     return {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
 
 

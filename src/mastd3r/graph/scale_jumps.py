@@ -1,0 +1,88 @@
+"""Where the scale jumps: what follows is tried again at the scale that goes on as before.
+
+A camera that walks changes its speed, and looks at what is near and far. Where both its speed and the depth of what it
+sees are suddenly many times what they were, it is the unit of length that has changed: few matches went through, as at
+a fast turn with somebody in front. The solver does not leave such a minimum, though the true one costs less.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.se3 import inverse
+from ..geometry.sim3 import Sim3
+from .keyframe_graph import KeyframeGraph
+from .passages import cost_around, state_of
+
+Array = NDArray[Any]
+log = logging.getLogger(__name__)
+SPAN, LEAST_SPAN = 6, 2  # keyframes on either side, whose speed and depth are compared, and at least
+JUMP = 2.0  # times, that both change: another scale is tried
+MOST_TRIED = 3  # jumps, the largest first
+BETTER = 0.998  # of the cost, for another scale to be taken
+
+
+def mend_scale_jumps(graph: KeyframeGraph) -> int:
+    """Try the scale before a jump for all that follows it, in the submap being tracked; how often it was taken.
+
+    It is where the whole chain costs less. Nothing is tried where depths are measured.
+    """
+    taken, tried = 0, set[int]()
+    while len(tried) < MOST_TRIED and not graph.depths_measured:
+        jump = next((j for j in scale_jumps(graph) if j[0] not in tried), None)
+        if jump is None:
+            break
+        tried.add(jump[0])
+        taken += _rescaled(graph, *jump)
+    return taken
+
+
+def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
+    """Keyframes at which lengths are ``ratio`` times what they were before, the largest change first.
+
+    The ratio is the lesser of those of speed and depth. Of neighbours the one with the largest is named.
+    """
+    ids = graph.free_members()
+    if len(ids) < 2 * LEAST_SPAN + 2:
+        return []
+    place = np.array([inverse(graph.variables[k].cam_from_world)[:3, 3] for k in ids])
+    time_s = np.array([graph.keyframes[k].work.timestamp_s for k in ids])
+    gap_s = np.maximum(np.abs(np.diff(time_s)), 1e-9)
+    speed = np.log(np.maximum(np.linalg.norm(np.diff(place, axis=0), axis=1) / gap_s, 1e-12))
+    depth = -np.log(np.maximum([graph.median_inv_depth(k) for k in ids], 1e-12))
+    found: list[tuple[float, int]] = []
+    for n in range(LEAST_SPAN + 1, len(ids) - LEAST_SPAN):  # the step from n - 1 to n belongs to neither side
+        faster = float(np.median(speed[n : n + SPAN]) - np.median(speed[max(n - 1 - SPAN, 0) : n - 1]))
+        farther = float(np.median(depth[n : n + SPAN]) - np.median(depth[max(n - SPAN, 0) : n]))
+        if faster * farther > 0 and min(abs(faster), abs(farther)) > np.log(JUMP):
+            found.append((float(np.copysign(min(abs(faster), abs(farther)), faster)), n))
+    out: list[tuple[int, float]] = []
+    for change, n in sorted(found, key=lambda x: -abs(x[0])):
+        if all(abs(n - ids.index(k)) > LEAST_SPAN for k, _ in out):
+            out.append((ids[n], float(np.exp(change))))
+    return out
+
+
+def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float) -> bool:
+    """Bring a keyframe, and what follows it, to the scale before, if the whole chain costs less so; whether it does."""
+    after = [k for k in graph.free_members() if k >= kf_id]
+    around = [max((k for k in graph.free_members() if k < kf_id), default=kf_id), kf_id]
+    before, kept, lens = cost_around(graph, around), state_of(graph), graph.intrinsics
+    centre = inverse(graph.variables[kf_id].cam_from_world)[:3, 3]
+    there = Sim3(np.eye(3), centre - centre / ratio, 1 / ratio)
+    graph.transform_keyframes(after, there)
+    now = cost_around(graph, around)
+    better = now < BETTER * before
+    log.info("frame %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
+             graph.keyframes[kf_id].work.index, ratio, before, now, "taken" if better else "left")  # fmt: skip
+    if not better:
+        graph.transform_keyframes(after, there.inverse())  # the priors of depths, and the frames that hang on them
+        graph.set_intrinsics(lens)
+        for k, (pose, inv_depth) in kept.items():
+            graph.set_keyframe_pose(k, pose)
+            graph.set_depths(k, inv_depth)
+    return better
