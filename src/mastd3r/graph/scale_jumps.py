@@ -44,7 +44,7 @@ def mend_scale_jumps(graph: KeyframeGraph) -> int:
 def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
     """Keyframes at which lengths are ``ratio`` times what they were before, the largest change first.
 
-    The ratio is the lesser of those of speed and depth. Of neighbours the one with the largest is named.
+    The ratio is the lesser of those of speed and depth. Of neighbours the one where both change most is named.
     """
     ids = graph.free_members()
     if len(ids) < 2 * LEAST_SPAN + 2:
@@ -54,15 +54,20 @@ def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
     gap_s = np.maximum(np.abs(np.diff(time_s)), 1e-9)
     speed = np.log(np.maximum(np.linalg.norm(np.diff(place, axis=0), axis=1) / gap_s, 1e-12))
     depth = -np.log(np.maximum([graph.median_inv_depth(k) for k in ids], 1e-12))
-    found: list[tuple[float, int]] = []
+    found: list[tuple[float, float, int]] = []
     for n in range(LEAST_SPAN + 1, len(ids) - LEAST_SPAN):  # the step from n - 1 to n belongs to neither side
-        faster = float(np.median(speed[n : n + SPAN]) - np.median(speed[max(n - 1 - SPAN, 0) : n - 1]))
-        farther = float(np.median(depth[n : n + SPAN]) - np.median(depth[max(n - SPAN, 0) : n]))
+        sides = (
+            (speed[max(n - 1 - SPAN, 0) : n - 1], speed[n : n + SPAN]),
+            (depth[max(n - SPAN, 0) : n], depth[n : n + SPAN]),
+        )
+        faster, farther = (float(np.median(later) - np.median(before)) for before, later in sides)
         if faster * farther > 0 and min(abs(faster), abs(farther)) > np.log(JUMP):
-            found.append((float(np.copysign(min(abs(faster), abs(farther)), faster)), n))
+            # medians tell that there is one, means where
+            sharpness = min(abs(float(later.mean() - before.mean())) for before, later in sides)
+            found.append((sharpness, float(np.copysign(min(abs(faster), abs(farther)), faster)), n))
     out: list[tuple[int, float]] = []
-    for change, n in sorted(found, key=lambda x: -abs(x[0])):
-        if all(abs(n - ids.index(k)) > LEAST_SPAN for k, _ in out):
+    for _, change, n in sorted(found, reverse=True):
+        if all(abs(n - ids.index(k)) > SPAN for k, _ in out):
             out.append((ids[n], float(np.exp(change))))
     return out
 

@@ -1,0 +1,91 @@
+"""Where the scale of a chain jumps: it is found, mended where that explains more, and left where it does not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mastd3r.config import CameraConfig, GraphConfig
+from mastd3r.geometry.se3 import inverse
+from mastd3r.geometry.sim3 import Sim3
+from mastd3r.graph.intrinsics import intrinsics_for
+from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.graph.scale_jumps import LEAST_SPAN, mend_scale_jumps, scale_jumps
+from test_submaps import keyframe, world_from
+
+VIEWS, JUMP_AT = 14, 7
+
+
+@pytest.fixture(scope="module")
+def scene(exact_scene: Callable[..., Any]) -> Any:
+    return exact_scene(VIEWS, step=0.08, cell_px=10)
+
+
+def chain(scene: Any, ratio: float, across: float = 1.0) -> KeyframeGraph:
+    """Keyframes from ``JUMP_AT`` on are ``ratio`` times as large about the first of them as they are; matches between
+    the two parts weigh ``across``."""
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
+    for k in range(VIEWS):
+        keyframe(graph, scene, k, k / 10, inverse(world_from(scene, k)), 1 / scene.depth(k))
+        graph.variables[k].prior_info = graph.variables[k].prior_info * 1e-3
+    graph.started.add(0)
+    for i in range(VIEWS):
+        for j in range(max(i - 2, 0), min(i + 3, VIEWS)):
+            if i != j:
+                weight = across if (i < JUMP_AT) != (j < JUMP_AT) else 1.0
+                if weight:
+                    graph.connect(i, j, scene.matches(i, j), np.full(len(scene.px), weight), followed=True)
+    centre = graph.world_from_cam(JUMP_AT)[:3, 3]
+    graph.transform_keyframes(range(JUMP_AT, VIEWS), Sim3(np.eye(3), centre - ratio * centre, ratio))
+    return graph
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.2, 4.0])
+def test_a_jump_is_found_and_mended(scene: Any, ratio: float) -> None:
+    graph = chain(scene, ratio)
+    (kf_id, found), *others = scale_jumps(graph)
+    assert abs(kf_id - JUMP_AT) <= LEAST_SPAN and found == pytest.approx(ratio, rel=0.5) and not others
+    assert mend_scale_jumps(graph) == 1
+    true = np.linalg.norm(np.diff([world_from(scene, k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff([graph.world_from_cam(k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
+    np.testing.assert_allclose(steps / steps.mean(), true / true.mean(), rtol=0.02)
+    assert scale_jumps(graph) == []
+
+
+def test_a_jump_that_nothing_speaks_against_is_left_with_all_that_belongs_to_it(scene: Any) -> None:
+    """No match goes across: any scale is as good as another, and the one that is there stays."""
+    graph = chain(scene, 0.2, across=0.0)
+    assert len(scale_jumps(graph)) == 1
+    kept = {k: (v.cam_from_world.copy(), v.inv_depth.copy(), v.prior_depth.copy()) for k, v in graph.variables.items()}
+    assert mend_scale_jumps(graph) == 0
+    for k, (pose, inv_depth, prior) in kept.items():
+        v = graph.variables[k]
+        ratio = np.median(v.inv_depth / inv_depth)  # the unit of length may have been set anew
+        np.testing.assert_allclose(v.inv_depth, ratio * inv_depth, rtol=1e-3)
+        np.testing.assert_allclose(v.prior_depth, ratio * prior, rtol=1e-3)
+        np.testing.assert_allclose(v.cam_from_world[:3, :3], pose[:3, :3], atol=1e-3)
+    assert len(scale_jumps(graph)) == 1
+
+
+def test_no_jump_is_seen_where_speed_alone_changes_or_depths_are_measured(scene: Any) -> None:
+    graph = chain(scene, 1.0)
+    assert scale_jumps(graph) == []
+    for kf in graph.keyframes[JUMP_AT:]:  # the later ones came ten times as fast
+        sooner = replace(kf.work, timestamp_s=0.7 + (kf.work.timestamp_s - 0.7) / 10)
+        graph.keyframes[kf.id] = replace(kf, work=sooner)
+    assert scale_jumps(graph) == []
+    graph = chain(scene, 0.2)
+    for v in graph.variables.values():
+        v.prior_info = 100 / v.inv_depth**2
+    assert graph.depths_measured and mend_scale_jumps(graph) == 0
+
+
+def test_a_short_chain_has_no_two_sides() -> None:
+    size = (64, 48)
+    assert scale_jumps(KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))) == []
