@@ -86,6 +86,25 @@ def test_lost_frames_are_bridged_between_tracked_ones(scene: Any) -> None:
     np.testing.assert_allclose(frames[8].world_from_cam[:3, 3], middle, atol=1e-9)
 
 
+def test_a_frame_that_next_to_no_match_agrees_with_lies_between_others(scene: Any, caplog: Any) -> None:
+    """Its matches were found at what moves: most disagree with any pose, and too few are left."""
+    graph = tracked_graph(scene, set())
+    record = graph.records[5]
+    off = np.random.default_rng(0).uniform(10, 60, record.target.shape).astype(np.float32)
+    off[:10] = 0
+    record.target = record.target + off
+    with caplog.at_level("INFO"):
+        frames = final_frames(graph)
+    assert [n for n, f in enumerate(frames) if f.state == "interpolated"] == [5] and "frame 5:" in caplog.text
+    np.testing.assert_allclose(
+        frames[5].world_from_cam, interpolate(frames[4].world_from_cam, frames[6].world_from_cam, 0.5), atol=1e-9
+    )
+    graph = tracked_graph(scene, set())
+    for r in graph.records:  # all have few: that is what this video has, and they agree
+        r.points, r.target, r.weight = r.points[:30], r.target[:30], r.weight[:30] * np.float32(0.5)
+    assert all(f.state == "tracked" for f in final_frames(graph))
+
+
 def test_frames_lost_at_the_ends_stand_still(scene: Any) -> None:
     frames = final_frames(tracked_graph(scene, {10, 11}, count=12))
     assert [f.state for f in frames[-3:]] == ["tracked", "interpolated", "interpolated"]

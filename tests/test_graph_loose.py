@@ -11,7 +11,7 @@ import pytest
 from mastd3r.geometry.se3 import se3_exp
 from mastd3r.geometry.sim3 import Sim3
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.loose import FIRM, firm_parts, leave_loose, loose_parts
+from mastd3r.graph.loose import FIRM, firm_parts, firm_weight, leave_loose, loose_parts
 from mastd3r.graph.submaps import join
 from test_submaps import SCALE, VIEWS, cut_graph
 
@@ -46,6 +46,11 @@ def test_parts_that_are_held_weakly_to_many_are_held() -> None:
     assert sorted(map(sorted, firm_parts(range(3), chain))) == [[0, 1], [2]]
     assert firm_parts(range(3), chain | pairs((0, 2, half))) == [frozenset({0, 1, 2})]
     assert len(firm_parts([0, 2], chain)) == 2  # what is not asked about joins nothing
+
+
+def test_a_link_is_firm_by_what_links_weigh_in_this_video() -> None:
+    assert firm_weight({}) == FIRM == firm_weight(pairs((0, 1, 400.0), (1, 2, 300.0), (0, 2, 3.0)))
+    assert firm_weight(pairs((0, 1, 40.0), (1, 2, 36.0), (0, 2, 1.0))) == pytest.approx(10.0)
 
 
 def test_what_is_held_firmly_stays(scene: Any) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import defaultdict
 from collections.abc import Collection
+from statistics import median
 
 from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
@@ -17,6 +18,7 @@ from .keyframe_graph import KeyframeGraph
 
 log = logging.getLogger(__name__)
 FIRM = 25.0  # weight of the matches between two parts that agree, either way: from here on their place is known
+FIRM_SHARE = 0.25  # of a keyframe's strongest link, the median: where matches are few, that is enough
 AGREES_PX = 3.0  # from where poses and depths put it, for a match to count
 FEW = 8  # keyframes of a part at most, for it to be given up
 
@@ -46,10 +48,8 @@ def loose_parts(graph: KeyframeGraph) -> list[list[int]]:
     A small part that others hang on stays: a thread is more than nothing there. So does what has a part of a saved map.
     """
     members = graph.members()
-    weights: dict[frozenset[int], float] = defaultdict(float)
-    for e in graph.edges_among(members):
-        weights[frozenset((e.i, e.j))] += _agreeing_weight(graph, e)
-    parts = sorted(firm_parts(members, weights), key=len)
+    weights = agreeing_weights(graph, members)
+    parts = sorted(firm_parts(members, weights, firm_weight(weights)), key=len)
     any_link = dict.fromkeys(weights, 1.0)
     loose: list[list[int]] = []
     rest = set(members)
@@ -62,6 +62,23 @@ def loose_parts(graph: KeyframeGraph) -> list[list[int]]:
                 break  # what hung on it may go now
         else:
             return loose
+
+
+def agreeing_weights(graph: KeyframeGraph, ids: Collection[int]) -> dict[frozenset[int], float]:
+    """By pair of keyframes: the weight of the matches that are where poses and depths put them, both ways."""
+    weights: dict[frozenset[int], float] = defaultdict(float)
+    for e in graph.edges_among(ids):
+        weights[frozenset((e.i, e.j))] += _agreeing_weight(graph, e)
+    return weights
+
+
+def firm_weight(weights: dict[frozenset[int], float]) -> float:
+    """The weight from which a link is firm: ``FIRM``, or less where a small or bare image has few matches."""
+    strongest: dict[int, float] = defaultdict(float)
+    for pair, weight in weights.items():
+        for k in pair:
+            strongest[k] = max(strongest[k], weight)
+    return min(FIRM, FIRM_SHARE * median(strongest.values())) if strongest else FIRM
 
 
 def _agreeing_weight(graph: KeyframeGraph, edge: ReprojectionFactor) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from ..graph.bundle_adjustment import SolveReport
 from ..graph.initialisation import bootstrap
 from ..graph.intrinsics import RADIAL, without_radial
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
+from ..graph.loose import AGREES_PX, FIRM_SHARE, agreeing_weights, firm_weight
 from ..graph.observability import Observability
 from ..graph.radial_terms import radial_is_told
 from ..graph.submaps import bridge_submaps
@@ -103,7 +104,10 @@ def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
 
 
 def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
-    """Every frame's pose from its kept matches and the final depths; lost ones between tracked ones interpolated."""
+    """Every frame's pose from its kept matches and the final depths; lost ones between tracked ones interpolated.
+
+    A frame whose matches hardly agree with the pose that they give is a lost one, too.
+    """
     out: list[FinalFrame] = []
     guess, kf_before = np.eye(4), -1
     for record in graph.records:
@@ -116,7 +120,25 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
         graph.set_record_pose(record, guess)
         cam_from_world = guess @ graph.variables[record.kf_id].cam_from_world
         out.append(FinalFrame(record, inverse(cam_from_world), record.state))
-    return _bridged(out)
+    return _bridged(_without_unsupported(graph, out))
+
+
+def _without_unsupported(graph: KeyframeGraph, frames: list[FinalFrame]) -> list[FinalFrame]:
+    """Frames as lost whose matches agree with their pose by less than makes a link firm, and than is usual."""
+    agreeing = {
+        n: _agreeing(graph, f.record)
+        for n, f in enumerate(frames)
+        if f.state != "lost" and not f.record.is_keyframe and len(f.record.points)
+    }
+    if not agreeing:
+        return frames
+    usual = FIRM_SHARE * float(np.median(list(agreeing.values())))
+    least = min(usual, firm_weight(agreeing_weights(graph, list(graph.variables))))
+    out = list(frames)
+    for n in (n for n, weight in agreeing.items() if weight < least):
+        log.info("frame %d: next to nothing agrees with its pose, it is lost", out[n].record.index)
+        out[n] = replace(out[n], state="lost")
+    return out
 
 
 def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
@@ -136,6 +158,12 @@ def _refined(graph: KeyframeGraph, record: FrameRecord, guess: Array) -> Array:
     other = solve_pose(matches, near, kernel_px=1.0).new_from_ref
     cost, cost_other = (matches.system(p, MOST_FIT_PX)[2] for p in (pose, other))
     return other if cost_other < CLEARLY * cost else pose
+
+
+def _agreeing(graph: KeyframeGraph, record: FrameRecord) -> float:
+    """Weight of a frame's kept matches that are where its pose puts them."""
+    matches = kept_matches(graph, record)
+    return float(matches.weight[matches.residual_px(record.cam_from_kf) < AGREES_PX].sum())
 
 
 def kept_matches(graph: KeyframeGraph, record: FrameRecord) -> StaticMatches:
