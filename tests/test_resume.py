@@ -149,6 +149,17 @@ def test_one_of_another_version_is_named_and_left(tmp_path: Path, caplog: pytest
     assert "expected one of version 2, got version 1" in caplog.text
 
 
+def test_one_of_another_format_is_named_and_left(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same version, as between two releases: what a part remembers may have changed."""
+    CheckpointStore(tmp_path / "c", "1").save([1])
+    monkeypatch.setattr("mastd3r.export.checkpoint.FORMAT", 99)
+    with caplog.at_level("WARNING", logger="mastd3r.export.checkpoint"):
+        assert CheckpointStore(tmp_path / "c", "1").load() is None
+    assert "expected one in format 99, got format 2" in caplog.text
+
+
 class _Runs:
     """Code, in place of data."""
 

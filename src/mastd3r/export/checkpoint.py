@@ -25,7 +25,7 @@ from ..types import WorkFrame
 from .files import replacing, writing
 
 log = logging.getLogger(__name__)
-FORMAT = 1  # of the files, and of what is in them
+FORMAT = 2  # of the files, and of what is in them
 MAGIC = b"mastd3r checkpoint\n"
 IN_BAND_BYTES = 2048  # an array that is smaller stands in the state itself
 GARBAGE_RATIO, GARBAGE_BYTES = 2.0, 2**26  # file size over what is used, and at least so much: written anew
@@ -188,8 +188,10 @@ class CheckpointStore:
         if hashlib.sha256(text).digest() != digest:
             raise InputError("expected a whole checkpoint, got a damaged one")
         head = json.loads(text)
-        if (head["format"], head["version"]) != (FORMAT, self.version):
+        if head["version"] != self.version:
             raise InputError(f"expected one of version {self.version}, got version {head['version']}")
+        if head["format"] != FORMAT:
+            raise InputError(f"expected one in format {FORMAT}, got format {head['format']}")
         if hashlib.sha256(body).hexdigest() != head["body"]:
             raise InputError("expected a whole checkpoint, got a damaged one")
         arrays = Path(str(head["arrays"])).name
