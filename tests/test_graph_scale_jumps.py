@@ -12,12 +12,13 @@ import pytest
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse
 from mastd3r.geometry.sim3 import Sim3
+from mastd3r.graph import scale_jumps as scale_jumps_module
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.scale_jumps import LEAST_SPAN, mend_scale_jumps, scale_jumps
 from test_submaps import keyframe, world_from
 
-VIEWS, JUMP_AT = 14, 7
+VIEWS, JUMP_AT = 20, 7
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +53,35 @@ def test_a_jump_is_found_and_mended(scene: Any, ratio: float) -> None:
     (kf_id, found), *others = scale_jumps(graph)
     assert abs(kf_id - JUMP_AT) <= LEAST_SPAN and found == pytest.approx(ratio, rel=0.5) and not others
     assert mend_scale_jumps(graph) == 1
-    true = np.linalg.norm(np.diff([world_from(scene, k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
-    steps = np.linalg.norm(np.diff([graph.world_from_cam(k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
-    np.testing.assert_allclose(steps / steps.mean(), true / true.mean(), rtol=0.02)
+    np.testing.assert_allclose(steps_of(graph), steps_of(chain(scene, 1.0)), rtol=0.02)
     assert scale_jumps(graph) == []
+
+
+def steps_of(graph: KeyframeGraph) -> Any:
+    """Lengths between keyframes, of their mean."""
+    steps = np.linalg.norm(np.diff([graph.world_from_cam(k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
+    return steps / steps.mean()
+
+
+def test_what_lies_between_two_jumps_is_mended_by_itself(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last keyframes see what the first saw, and are where they should be: what is small lies between."""
+    graph = chain(scene, 1.0)
+    true = steps_of(graph)
+    centre = graph.world_from_cam(JUMP_AT)[:3, 3]
+    graph.transform_keyframes(range(JUMP_AT, JUMP_AT + 7), Sim3(np.eye(3), 0.75 * centre, 0.25))
+    found = sorted(scale_jumps(graph))
+    assert len(found) == 2 and found[0][1] < 1 < found[1][1]
+    tried: list[int | None] = []
+    whole = scale_jumps_module._rescaled
+
+    def seen(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = None) -> bool:
+        tried.append(end)
+        return whole(graph, kf_id, ratio, end)
+
+    monkeypatch.setattr(scale_jumps_module, "_rescaled", seen)
+    assert mend_scale_jumps(graph) >= 1
+    assert tried[0] is None or abs(tried[0] - JUMP_AT - 7) <= LEAST_SPAN
+    np.testing.assert_allclose(steps_of(graph), true, rtol=0.02)
 
 
 def test_a_jump_that_nothing_speaks_against_is_left_with_all_that_belongs_to_it(scene: Any) -> None:

@@ -27,18 +27,28 @@ BETTER = 0.998  # of the cost, for another scale to be taken
 
 
 def mend_scale_jumps(graph: KeyframeGraph) -> int:
-    """Try the scale before a jump for all that follows it, in the submap being tracked; how often it was taken.
+    """Try the scale before a jump for what follows it, in the submap being tracked; how often it was taken.
 
-    It is where the whole chain costs less. Nothing is tried where depths are measured.
+    Where a later jump leads back, what lies between the two is tried by itself first: the rest may hang together by
+    other views. Another scale is taken where the whole chain costs less. None is tried where depths are measured.
     """
     taken, tried = 0, set[int]()
     while len(tried) < MOST_TRIED and not graph.depths_measured:
-        jump = next((j for j in scale_jumps(graph) if j[0] not in tried), None)
+        jumps = scale_jumps(graph)
+        jump = next((j for j in jumps if j[0] not in tried), None)
         if jump is None:
             break
         tried.add(jump[0])
-        taken += _rescaled(graph, *jump)
+        back = _leads_back(jumps, *jump)
+        done = back is not None and _rescaled(graph, *jump, back)
+        taken += done or _rescaled(graph, *jump)
     return taken
+
+
+def _leads_back(jumps: list[tuple[int, float]], kf_id: int, ratio: float) -> int | None:
+    """The first jump after a keyframe, if it undoes most of the one there."""
+    later = min((j for j in jumps if j[0] > kf_id), default=None)
+    return later[0] if later is not None and abs(np.log(later[1] * ratio)) < np.log(JUMP) else None
 
 
 def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
@@ -72,9 +82,12 @@ def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
     return out
 
 
-def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float) -> bool:
-    """Bring a keyframe, and what follows it, to the scale before, if the whole chain costs less so; whether it does."""
-    after = [k for k in graph.free_members() if k >= kf_id]
+def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = None) -> bool:
+    """Bring a keyframe, and what follows it, to the scale before, if the whole chain costs less so; whether it does.
+
+    ``end``: the first keyframe that stays; default: none.
+    """
+    after = [k for k in graph.free_members() if k >= kf_id and (end is None or k < end)]
     around = [max((k for k in graph.free_members() if k < kf_id), default=kf_id), kf_id]
     before, kept, lens = cost_around(graph, around), state_of(graph), graph.intrinsics
     centre = inverse(graph.variables[kf_id].cam_from_world)[:3, 3]
@@ -82,8 +95,9 @@ def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float) -> bool:
     graph.transform_keyframes(after, there)
     now = cost_around(graph, around)
     better = now < BETTER * before
-    log.info("frame %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
-             graph.keyframes[kf_id].work.index, ratio, before, now, "taken" if better else "left")  # fmt: skip
+    frames = [graph.keyframes[k].work.index for k in (kf_id, after[-1])]
+    log.info("frames %d to %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
+             *frames, ratio, before, now, "taken" if better else "left")  # fmt: skip
     if not better:
         graph.transform_keyframes(after, there.inverse())  # the priors of depths, and the frames that hang on them
         graph.set_intrinsics(lens)
