@@ -7,14 +7,13 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from mastd3r.config import Config
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.parts import build_parts
 from mastd3r.tracking import keyframes as keyframes_module
-from mastd3r.tracking.joining import give_up_unscaled, join_recognised
+from mastd3r.tracking.joining import give_up_unscaled
 from mastd3r.tracking.keyframes import Keyframes
 from test_submaps import CUT, VIEWS, cut_graph
 
@@ -85,33 +84,3 @@ def test_what_cannot_be_joined_is_given_up_after_the_last_frame(scene: Any, monk
     keyframes.finish(SimpleNamespace(last=None))  # type: ignore[arg-type]
     keyframes.close()
     assert len(graph.keyframes) == VIEWS - 2 and graph.submap == 1 and not keyframes.edges.flows
-
-
-@pytest.mark.parametrize("matched", [False, True])
-@pytest.mark.parametrize("tracked", [0, 1])
-def test_a_piece_is_joined_only_where_matches_are_found_from_there(scene: Any, matched: bool, tracked: int) -> None:
-    """Keyframe 6 is taken for a view of the place of 3: what is seen from there says whether it is one."""
-    graph = cut_graph(scene)
-    graph.submap = tracked
-    asked: list[tuple[int, int]] = []
-
-    def add(graph: KeyframeGraph, i: int, j: int) -> bool:
-        asked.append((i, j))
-        return matched and graph.connect(i, j, scene.matches(i, j), np.ones(len(scene.px)))
-
-    view = SimpleNamespace(
-        anchor=graph.keyframes[3],
-        alignment=SimpleNamespace(new_from_ref=scene.j_from_i(3, 6)),
-        pair=SimpleNamespace(matches=scene.matches(3, 6)),
-        weight=np.ones(len(scene.px)),
-    )
-    parts = SimpleNamespace(features=SimpleNamespace(alike=lambda _, others: np.full(len(others), np.nan)))
-    eyes: Any = SimpleNamespace(parts=parts, relocalised=lambda *_: view, beyond_doubt=lambda *_: True)
-    places: Any = SimpleNamespace(best=lambda graph, work, ids: [graph.keyframes[3]])
-    entry: Any = SimpleNamespace(view=lambda *_: None, open_to=lambda ids: ids)
-    edges: Any = SimpleNamespace(add=add)
-    assert join_recognised(graph, graph.keyframes[6], eyes, edges, places, entry, []) == matched
-    assert asked == [(k, 6) for k in (1, 2, 3, 4)]
-    assert graph.members(0) == list(range(VIEWS if matched else CUT))
-    assert graph.started == ({0} if matched else {0, 1})
-    assert graph.submap == (0 if matched else tracked)

@@ -212,9 +212,9 @@ class KeyframeGraph:
                 r.state, r.is_keyframe, (r.points, r.target, r.weight) = "lost", False, no_matches()
             r.kf_id = max(int(np.searchsorted(kept, r.kf_id, "right")) - 1, 0)
 
-    def separate(self, ids: Iterable[int], submap: int | None = None) -> None:
-        """Some keyframes of a submap become one of their own, started as it was; ``submap``: its number."""
-        new = 1 + max(self.submap_of.values()) if submap is None else submap
+    def separate(self, ids: Iterable[int]) -> None:
+        """Some keyframes of a submap become one of their own, started as it was."""
+        new = 1 + max(self.submap_of.values())
         self.submap_of.update(dict.fromkeys(ids, new))
         self.started.add(new)
 

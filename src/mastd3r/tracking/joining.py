@@ -30,29 +30,22 @@ def join_recognised(
 ) -> bool:
     """Recognise a place of another submap in ``kf``; the two become one. The other submap's world is kept.
 
-    From where that puts it, matches must be found with the keyframes there, or it is taken back: nothing would hold the
-    two together, and two places that look alike are not one.
     ``unscaled`` takes the views of such places whose scale is not known: too few points have a depth on both sides.
     """
-    own, tracked = graph.submap_of[kf.id], graph.submap
+    own = graph.submap_of[kf.id]
     for view in _seen_elsewhere(graph, kf, two_view, places, entry):
         other, pose = view.anchor, view.alignment.new_from_ref
         kf_from_other = with_scale(graph, other.id, kf.id, pose, view.pair.matches, view.weight)
         if kf_from_other is None:
             unscaled.append(view)
             continue
-        scale, moved, count = 1 / kf_from_other.scale, graph.members(own), len(graph.edges)
+        scale = 1 / kf_from_other.scale
         log.info("submap %d joined at keyframes %d and %d, scale %.3f", own, other.id, kf.id, scale)
         join(graph, other.id, kf.id, kf_from_other)
         around = range(max(0, other.id - MATCHED_AROUND), min(len(graph.keyframes), other.id + MATCHED_AROUND + 1))
         for k in around:
-            if k not in moved and graph.submap_of[k] == graph.submap_of[kf.id]:
+            if k != kf.id and graph.submap_of[k] == graph.submap_of[kf.id]:
                 edges.add(graph, k, kf.id)
-        if len(graph.edges) == count and not graph.held:
-            log.info("submap %d is apart again: nothing around keyframe %d matches", own, other.id)
-            graph.separate(moved, own)
-            graph.submap = tracked
-            continue
         graph.solve_all(10, 2.0)
         return True
     return False
