@@ -64,24 +64,37 @@ def steps_of(graph: KeyframeGraph) -> Any:
 
 
 def test_what_lies_between_two_jumps_is_mended_by_itself(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The last keyframes see what the first saw, and are where they should be: what is small lies between."""
+    """The first keyframes and the last are at one scale, what is between them is small: the last stay as they are."""
     graph = chain(scene, 1.0)
-    true = steps_of(graph)
+    true, end = steps_of(graph), JUMP_AT + 7
     centre = graph.world_from_cam(JUMP_AT)[:3, 3]
-    graph.transform_keyframes(range(JUMP_AT, JUMP_AT + 7), Sim3(np.eye(3), 0.75 * centre, 0.25))
-    found = sorted(scale_jumps(graph))
-    assert len(found) == 2 and found[0][1] < 1 < found[1][1]
-    tried: list[int | None] = []
+    graph.transform_keyframes(range(JUMP_AT, end), Sim3(np.eye(3), 0.75 * centre, 0.25))
+    first, second = sorted(scale_jumps(graph))
+    assert first[1] < 1 < second[1]
+    assert scale_jumps_module._leads_back([second, first], *first) == second[0]
+    assert scale_jumps_module._leads_back([second, first], *second) is None
+    assert scale_jumps_module._leads_back([(second[0], 20.0), first], *first) is None
+    monkeypatch.setattr(scale_jumps_module, "scale_jumps", lambda _: [first, second])
+    tried: list[tuple[int, int | None]] = []
     whole = scale_jumps_module._rescaled
 
     def seen(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = None) -> bool:
-        tried.append(end)
+        tried.append((kf_id, end))
         return whole(graph, kf_id, ratio, end)
 
     monkeypatch.setattr(scale_jumps_module, "_rescaled", seen)
     assert mend_scale_jumps(graph) >= 1
-    assert tried[0] is None or abs(tried[0] - JUMP_AT - 7) <= LEAST_SPAN
+    assert tried[0] == (first[0], second[0])
     np.testing.assert_allclose(steps_of(graph), true, rtol=0.02)
+
+
+def test_only_what_lies_before_the_end_is_brought_to_another_scale(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, costs = chain(scene, 1.0), iter([2.0, 1.0])
+    monkeypatch.setattr(scale_jumps_module, "cost_around", lambda *_: next(costs))
+    depths = {k: v.inv_depth.copy() for k, v in graph.variables.items()}
+    assert scale_jumps_module._rescaled(graph, 5, 0.5, 9)
+    for k, v in graph.variables.items():
+        np.testing.assert_allclose(v.inv_depth, depths[k] * (0.5 if 5 <= k < 9 else 1.0))
 
 
 def test_a_jump_that_nothing_speaks_against_is_left_with_all_that_belongs_to_it(scene: Any) -> None:

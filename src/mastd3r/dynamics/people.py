@@ -95,7 +95,7 @@ class PeoplePrior:
                 found = maps[self._turns.quarter(time_s)]
             else:
                 found = self._seen(frame.image, self._turns.quarter(time_s))
-            somebody = self._turns.believed(time_s, found)
+            somebody = self._turns.shows_somebody(time_s, found)
             self._looks.append((time_s, somebody))
         return replace(frame, semantic=found) if somebody else frame
 
@@ -164,7 +164,7 @@ class _Turns:
             return self._first
         return best if sure[best] > BETTER_TURNED * sure[0] else 0
 
-    def believed(self, time_s: float, found: Array) -> bool:
+    def shows_somebody(self, time_s: float, found: Array) -> bool:
         """Whether a map of the turn taken at a time shows somebody, by itself or by what was seen until then."""
         if np.count_nonzero(found > 0.5) < SOMEBODY * found.size:
             return False

@@ -10,12 +10,19 @@ import logging
 from collections import defaultdict
 from collections.abc import Collection
 from statistics import median
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
 from .factors import ReprojectionFactor
 from .keyframe_graph import KeyframeGraph
 
+Array = NDArray[Any]
 log = logging.getLogger(__name__)
 FIRM = 25.0  # weight of the matches between two parts that agree, either way: from here on their place is known
 FIRM_SHARE = 0.25  # of a keyframe's strongest link, the median: where matches are few, that is enough
@@ -94,27 +101,19 @@ def firm_parts(ids: Collection[int], weights: dict[frozenset[int], float], least
 
     ``weights``: of pairs. Two sets of which each is held weakly to the other by many pairs are one.
     """
-    part_of = {k: k for k in ids}
-
-    def root(k: int) -> int:
-        while part_of[k] != k:
-            part_of[k] = part_of[part_of[k]]
-            k = part_of[k]
-        return k
-
-    inside = [(tuple(pair), w) for pair, w in weights.items() if len(pair) == 2 and pair <= part_of.keys()]
+    row = {k: n for n, k in enumerate(ids)}
+    inside = [(*(row[k] for k in pair), w) for pair, w in weights.items() if len(pair) == 2 and pair <= row.keys()]
+    i, j, weight = np.array(inside, float).reshape(-1, 3).T
+    part: Array = np.arange(len(row))
     while True:
-        between: dict[tuple[int, int], float] = defaultdict(float)
-        for (i, j), w in inside:
-            a, b = sorted((root(i), root(j)))
-            if a != b:
-                between[a, b] += w
-        firm = [pair for pair, w in between.items() if w >= least]
-        if not firm:
+        count = len(set(part.tolist()))
+        ends = part[i.astype(int)], part[j.astype(int)]
+        between = coo_array((weight, (np.minimum(*ends), np.maximum(*ends))), shape=(count, count)).tocsr()
+        fewer, joined = connected_components(between >= least, directed=False)
+        if fewer == count:
             break
-        for a, b in firm:
-            part_of[root(a)] = root(b)
+        part = joined[part]
     parts: dict[int, set[int]] = defaultdict(set)
-    for k in ids:
-        parts[root(k)].add(k)
+    for k, n in row.items():
+        parts[int(part[n])].add(k)
     return [frozenset(p) for p in parts.values()]

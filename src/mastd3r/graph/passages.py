@@ -20,7 +20,7 @@ from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from .factors import KeyframeVariables, thinned_edge
 from .initialisation import attempt, first_pairs
-from .intrinsics import as_given
+from .intrinsics import Intrinsics, as_given
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
 from .windows import ALL_INTRINSICS, Window
@@ -117,10 +117,7 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
         log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
                  before, after)  # fmt: skip
         return True
-    graph.set_intrinsics(lens)
-    for k, (pose, inv_depth) in kept.items():
-        graph.set_keyframe_pose(k, pose)
-        graph.set_depths(k, inv_depth)
+    put_back(graph, kept, lens)
     return False
 
 
@@ -196,7 +193,16 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
 
 
 def state_of(graph: KeyframeGraph) -> State:
+    """Poses and inverse depths of all keyframes, as they are now."""
     return {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
+
+
+def put_back(graph: KeyframeGraph, state: State, lens: Intrinsics) -> None:
+    """Poses and inverse depths as ``state_of`` gave them, and the intrinsics of then."""
+    graph.set_intrinsics(lens)
+    for k, (pose, inv_depth) in state.items():
+        graph.set_keyframe_pose(k, pose)
+        graph.set_depths(k, inv_depth)
 
 
 # -- back into the chain -----------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from .keyframe_graph import KeyframeGraph
-from .passages import cost_around, state_of
+from .passages import cost_around, put_back, state_of
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -100,8 +100,5 @@ def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = 
              *frames, ratio, before, now, "taken" if better else "left")  # fmt: skip
     if not better:
         graph.transform_keyframes(after, there.inverse())  # the priors of depths, and the frames that hang on them
-        graph.set_intrinsics(lens)
-        for k, (pose, inv_depth) in kept.items():
-            graph.set_keyframe_pose(k, pose)
-            graph.set_depths(k, inv_depth)
+        put_back(graph, kept, lens)
     return better
