@@ -50,6 +50,25 @@ def test_project_and_rays_are_inverse(camera: Camera) -> None:
 
 
 @QUICK
+@given(cameras, st.booleans())
+def test_the_kernels_are_numpy_to_the_last_bit(camera: Camera, bent: bool) -> None:
+    camera = camera if bent else camera.pinhole
+    px, (k1, k2, k3) = sample_px(camera), (camera.k1, camera.k2, camera.k3)
+    focal, centre = np.array([camera.fx_px, camera.fy_px]), np.array([camera.cx_px, camera.cy_px])
+    x = seen = (px - centre) / focal
+    for _ in range(10 if bent else 0):
+        r2 = (x**2).sum(-1, keepdims=True)
+        x = seen / (1 + r2 * (k1 + r2 * (k2 + k3 * r2)))
+    rays = camera.rays(px.reshape(5, 10, 2))
+    np.testing.assert_array_equal(rays, np.concatenate([x, np.ones((50, 1))], -1).reshape(5, 10, 3))
+    points = rays * np.random.default_rng(1).uniform(0.5, 9, (5, 10, 1))
+    xy = points[..., :2] / points[..., 2:]
+    r2 = (xy**2).sum(-1, keepdims=True)
+    np.testing.assert_array_equal(camera.project(points), xy * (1 + r2 * (k1 + r2 * (k2 + k3 * r2))) * focal + centre)
+    assert camera.rays(px[0]).shape == (3,) and camera.project(points[0, 0]).shape == (2,)
+
+
+@QUICK
 @given(cameras, st.floats(0.2, 3))
 def test_resizing_keeps_every_ray(camera: Camera, scale: float) -> None:
     """A point of the picture at pixel p (centres at integers) is at (p + 1/2) s - 1/2 of the scaled picture."""

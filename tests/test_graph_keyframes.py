@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mastd3r.camera.pinhole import Camera
 from mastd3r.config import CameraConfig, GraphConfig
-from mastd3r.geometry.reprojection_kernels import anchor_cost
+from mastd3r.geometry.reprojection_kernels import AnchorMatches, anchor_cost
 from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
 from mastd3r.geometry.sim3 import procrustes
 from mastd3r.graph.covisibility import covisible, nearest_keyframe, overlap
@@ -58,9 +58,8 @@ def costs(graph: KeyframeGraph) -> Array:
     for e in graph.edges:
         a, b = graph.variables[e.i], graph.variables[e.j]
         j_from_i = (b.cam_from_world @ inverse(a.cam_from_world))[None]
-        out.append(
-            anchor_cost(a.px, a.inv_depth, e.target[None], e.weight[None], j_from_i, graph.intrinsics.values, 1.0)[0]
-        )
+        matches = AnchorMatches.of([e.target], [e.weight])
+        out.append(anchor_cost(a.px, a.inv_depth, matches, j_from_i, graph.intrinsics.values, 1.0)[0])
     return np.array(out)
 
 

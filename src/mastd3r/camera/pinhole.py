@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.lens_kernels import Lens, pixels_of, rays_of
+
 Array = NDArray[Any]
 
 
@@ -34,6 +36,11 @@ class Camera:
     def matrix(self) -> Array:
         """K, (3, 3) float64."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
+
+    @property
+    def _lens(self) -> Lens:
+        terms = self.fx_px, self.fy_px, self.cx_px, self.cy_px, self.k1, self.k2, self.k3
+        return tuple(map(float, terms))  # type: ignore[return-value]
 
     @property
     def pinhole(self) -> Camera:
@@ -72,20 +79,15 @@ class Camera:
 
     def project(self, points_cam: Array) -> Array:
         """(..., 3) points with z > 0 to (..., 2) pixels."""
-        xy = points_cam[..., :2] / points_cam[..., 2:]
-        r2 = (xy**2).sum(-1, keepdims=True)
-        xy = xy * (1 + r2 * (self.k1 + r2 * (self.k2 + self.k3 * r2)))
-        return xy * np.array([self.fx_px, self.fy_px]) + np.array([self.cx_px, self.cy_px])
+        points = np.ascontiguousarray(points_cam, float)
+        found: Array = pixels_of(points.reshape(-1, 3), self._lens)
+        return found.reshape(*points.shape[:-1], 2)
 
     def rays(self, px: Array) -> Array:
         """(..., 2) pixels to (..., 3) rays with z = 1 (fixed-point undistortion, 10 rounds)."""
-        xd = (np.asarray(px, float) - np.array([self.cx_px, self.cy_px])) / np.array([self.fx_px, self.fy_px])
-        x = xd
-        if self.distorted:
-            for _ in range(10):
-                r2 = (x**2).sum(-1, keepdims=True)
-                x = xd / (1 + r2 * (self.k1 + r2 * (self.k2 + self.k3 * r2)))
-        return np.concatenate([x, np.ones_like(x[..., :1])], -1)
+        pixels = np.ascontiguousarray(px, float)
+        found: Array = rays_of(pixels.reshape(-1, 2), self._lens, self.distorted)
+        return found.reshape(*pixels.shape[:-1], 3)
 
     def unproject(self, px: Array, inv_depth: Array) -> Array:
         """(..., 2) pixels and their inverse depths (...), not 0, to (..., 3) points."""

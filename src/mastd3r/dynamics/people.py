@@ -19,6 +19,7 @@ from .config import SemanticConfig
 Array = NDArray[Any]
 Looks = tuple[tuple[float, bool], ...]  # time, and whether somebody was seen
 Turns = tuple[int, tuple[tuple[float, tuple[float, ...], tuple[float, ...]], ...]]  # first; time, shares by turn
+Shares = tuple[Array, Array]  # of an image that are surely and perhaps people, of each turn (4,)
 log = logging.getLogger(__name__)
 UNSURE = 1.0  # log-odds of the evidence below which it says nothing, either way
 STILL_SHARE, MOVING_SHARE = 0.3, 0.03  # of a figure, that is seen to stand still, at least, and to move, at most
@@ -81,6 +82,8 @@ class PeoplePrior:
         self._network = network
         self._looks: deque[tuple[float, bool]] = deque(maxlen=REMEMBERED)  # time, and whether somebody was seen
         self._turns = _Turns()
+        self._found: dict[float, tuple[bool, Shares | None]] = {}  # by time: somebody, and what turns were compared by
+        self._known: dict[float, tuple[bool, Shares | None]] = {}  # the same, of the pass before
         self._one_at_a_time = threading.Lock()
 
     def fill(self, frame: Frame) -> Frame:
@@ -89,15 +92,9 @@ class PeoplePrior:
         with self._one_at_a_time:
             if not self._due(time_s):
                 return frame
-            if self._turns.due(time_s):
-                maps = [self._seen(frame.image, quarter) for quarter in range(4)]
-                self._turns.compare(time_s, maps)
-                found = maps[self._turns.quarter(time_s)]
-            else:
-                found = self._seen(frame.image, self._turns.quarter(time_s))
-            somebody = self._turns.shows_somebody(time_s, found)
-            self._looks.append((time_s, somebody))
-        return replace(frame, semantic=found) if somebody else frame
+            found = self._again(frame) if time_s in self._known else self._looked(frame)
+            self._looks.append((time_s, found is not None))
+        return frame if found is None else replace(frame, semantic=found)
 
     def features(self, frame: Frame) -> None:
         """None: descriptors are made of the image."""
@@ -115,14 +112,41 @@ class PeoplePrior:
             self._turns.remember(memory[1])
 
     def forget(self) -> None:
-        """The next frame is the first of the same video; the way up that was found last is where it begins."""
+        """The next frame is the first of the same video; the way up that was found last is where it begins.
+
+        Where that is the way up that this pass began with, the next one would find the same of every image, and the
+        network is asked only where somebody was seen.
+        """
         with self._one_at_a_time:
             self._looks.clear()
-            self._turns = _Turns(self._turns.quarter(np.inf))
+            quarter = self._turns.quarter(np.inf)
+            self._known = self._found if quarter == self._turns.first else {}
+            self._found, self._turns = {}, _Turns(quarter)
 
     def _due(self, time_s: float) -> bool:
         last = max((look for look in self._looks if look[0] < time_s), default=None)
         return last is None or last[1] or time_s - last[0] > AGAIN_S - TOLERANCE_S
+
+    def _looked(self, frame: Frame) -> Array | None:
+        """P(person) of a frame; None where it shows nobody."""
+        time_s, turns, shares = frame.timestamp_s, self._turns, None
+        if turns.due(time_s):
+            maps = [self._seen(frame.image, quarter) for quarter in range(4)]
+            shares = _shares_of(maps)
+            turns.compare(time_s, shares)
+            found = maps[turns.quarter(time_s)]
+        else:
+            found = self._seen(frame.image, turns.quarter(time_s))
+        somebody = turns.shows_somebody(time_s, found)
+        self._found.setdefault(time_s, (somebody, shares))
+        return found if somebody else None
+
+    def _again(self, frame: Frame) -> Array | None:
+        """``_looked`` of a frame that the pass before has looked at."""
+        somebody, shares = self._found[frame.timestamp_s] = self._known[frame.timestamp_s]
+        if shares is not None:
+            self._turns.compare(frame.timestamp_s, shares)
+        return self._seen(frame.image, self._turns.quarter(frame.timestamp_s)) if somebody else None
 
     def _seen(self, image: Array, quarter: int) -> Array:
         """P(person) by the network, of the image turned by ``quarter`` times 90 degrees, turned back."""
@@ -135,8 +159,8 @@ class _Turns:
 
     def __init__(self, first: int = 0) -> None:
         """``first``: the turn that is taken until there is enough to tell."""
-        self._shares: dict[float, tuple[Array, Array]] = {}  # by time: surely, and perhaps people, of each turn (4,)
-        self._first = self._said = first
+        self._shares: dict[float, Shares] = {}  # by time
+        self.first = self._said = first
 
     def due(self, time_s: float) -> bool:
         """Whether it is to be found again at a time."""
@@ -144,10 +168,9 @@ class _Turns:
         again_s = TURN_AGAIN_S if len(before) >= TURNS_SOON else TURN_SOON_S
         return not before or time_s - max(before) > again_s - TOLERANCE_S
 
-    def compare(self, time_s: float, maps: Sequence[Array]) -> None:
+    def compare(self, time_s: float, shares: Shares) -> None:
         """Add what the network shows of the four turns of one image."""
-        surely, perhaps = np.array([_shares(m) for m in maps]).T
-        self._shares[time_s] = surely, perhaps
+        self._shares[time_s] = shares
         for old in sorted(self._shares)[:-TURNS_REMEMBERED]:
             del self._shares[old]
         quarter = self.quarter(time_s)
@@ -161,7 +184,7 @@ class _Turns:
         sure = surely / perhaps
         best = int(np.argmax(sure))
         if times < LEAST_TURNS or sure[best] < SURE_TURNED:
-            return self._first
+            return self.first
         return best if sure[best] > BETTER_TURNED * sure[0] else 0
 
     def shows_somebody(self, time_s: float, found: Array) -> bool:
@@ -182,13 +205,19 @@ class _Turns:
     def memory(self) -> Turns:
         """What was found when, as numbers."""
         found = tuple((t, tuple(s.tolist()), tuple(p.tolist())) for t, (s, p) in self._shares.items())
-        return self._first, found
+        return self.first, found
 
     def remember(self, memory: Turns) -> None:
         """What ``memory`` gave."""
-        self._first, found = memory
+        self.first, found = memory
         self._shares = {t: (np.array(s), np.array(p)) for t, s, p in found}
         self._said = self.quarter(np.inf)
+
+
+def _shares_of(maps: Sequence[Array]) -> Shares:
+    """Shares of an image that are surely and perhaps people, of the four maps of its turns."""
+    surely, perhaps = np.array([_shares(m) for m in maps]).T
+    return surely, perhaps
 
 
 def _shares(found: Array) -> tuple[float, float]:

@@ -71,8 +71,12 @@ def evaluate(
     trajectory = read_poses(run_dir / "trajectory.txt")
     times, positions = trajectory.timestamps_s, trajectory.world_from_cam[:, :3, 3]
     moving = TrueMasks({_stamp(t): path for t, path in truth.moving_files.items()} if truth else {})
-    seen, holdout = _compare_renders(run_dir, frames, moving)
-    stamps = seen if timestamps_s is None else [_stamp(float(t)) for t in timestamps_s]
+    renders = {p.stem: p for p in (run_dir / "renders").glob("*.png")}
+    stamps = [] if timestamps_s is None else [_stamp(float(t)) for t in timestamps_s]
+    holdout: list[HoldoutError] = []
+    if renders or timestamps_s is None:  # else no photograph is asked for
+        seen, holdout = _compare_renders(run_dir, renders, frames, moving)
+        stamps = stamps or seen
     posed = {_stamp(float(t)) for t in times[np.isfinite(positions).all(1)]}
     metrics: dict[str, Any] = {"frames": len(stamps), "frames_posed": sum(s in posed for s in stamps)}
     ate = None
@@ -191,9 +195,10 @@ def _add_keyframe_error(metrics: dict[str, Any], run_dir: Path, truth: Truth) ->
         metrics["ate_rmse_keyframes_note"] = kf.reason
 
 
-def _compare_renders(run_dir: Path, frames: Iterable[Frame], moving: TrueMasks) -> tuple[list[str], list[HoldoutError]]:
+def _compare_renders(
+    run_dir: Path, renders: dict[str, Path], frames: Iterable[Frame], moving: TrueMasks
+) -> tuple[list[str], list[HoldoutError]]:
     """One pass over the frames: all their stamps, and the errors of those that have a render."""
-    renders = {p.stem: p for p in (run_dir / "renders").glob("*.png")}
     seen: list[str] = []
     holdout: list[HoldoutError] = []
     for frame in frames:

@@ -12,7 +12,8 @@ unknowns a pose perturbation of j (6), intrinsics g = (log f, k, cx, cy, m, n) (
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
@@ -210,33 +211,83 @@ def _edge_residual(
     return tx - g[2] - f * vx, ty - g[3] - f * vy, yz
 
 
+class AnchorMatches(NamedTuple):
+    """The matches with weight of one anchor keyframe, edge after edge: k in all of its m edges."""
+
+    first: Array  # (m + 1,) int64: those of edge e are first[e] to first[e + 1]
+    edge: Array  # (k,) int64
+    point: Array  # (k,) int64 of the anchor's p points, in order within an edge
+    target: Array  # (k, 2) float64 pixels in the edge's other end
+    weight: Array  # (k,) float64, above 0
+    of_point: Array  # (p + 1,) int64: those of point n are by_point[of_point[n]] to by_point[of_point[n + 1]]
+    by_point: Array  # (k,) int64 the matches, point after point, in order of their edges
+
+    @staticmethod
+    def of(targets: Sequence[Array], weights: Sequence[Array]) -> AnchorMatches:
+        """Of edges that say of all p points where they are, (p, 2) each, and with which weight, (p,) each."""
+        m, p = len(weights), len(weights[0])
+        first, edge, point = np.zeros(m + 1, np.int64), np.empty(m * p, np.int64), np.empty(m * p, np.int64)
+        target, weight = np.empty((m * p, 2)), np.empty(m * p)
+        for e in range(m):
+            first[e + 1] = _pack(targets[e], weights[e], e, first[e], edge, point, target, weight)
+        kept: tuple[Array, ...] = tuple(a[: first[m]].copy() for a in (edge, point, target, weight))
+        return AnchorMatches(first, *kept, *_sorted(kept[1], p))
+
+
+@nb.njit(**_JIT)
+def _pack(
+    targets: Array, weights: Array, e: int, at: int, edge: Array, point: Array, target: Array, weight: Array
+) -> int:
+    """Add the matches with weight of edge ``e`` from row ``at`` on; returns the row after them."""
+    for n in range(len(weights)):
+        if weights[n] > 0:
+            edge[at], point[at], weight[at] = e, n, weights[n]
+            target[at, 0], target[at, 1] = targets[n, 0], targets[n, 1]
+            at += 1
+    return at
+
+
+@nb.njit(**_JIT)
+def _sorted(point: Array, p: int) -> tuple[Array, Array]:
+    """``of_point`` and ``by_point`` of matches (k,) of p points."""
+    first, order = np.zeros(p + 1, np.int64), np.empty(len(point), np.int64)
+    for n in point:
+        first[n + 1] += 1
+    for n in range(p):
+        first[n + 1] += first[n]
+    at = first[:-1].copy()
+    for k in range(len(point)):
+        order[at[point[k]]] = k
+        at[point[k]] += 1
+    return first, order
+
+
 @nb.njit(**_JIT)
 def anchor_system(
-    px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
+    px: Array, depth: Array, matches: AnchorMatches, j_from_i: Array, g: Array, kernel_px: float
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Normal-equation parts of all m edges of one anchor keyframe.
 
-    Args: px (p, 2) pixels of it; depth (p,) inverse depths; target (m, p, 2) pixels in j; weight (m, p);
-        j_from_i (m, 4, 4); g (6,) intrinsics; kernel_px scale of the Cauchy kernel.
-    Returns: H (m, 12, 12), b (m, 12), E (m, p, 12) = w J^T J_d, H_dd (m, p), b_d (m, p), cost (m,).
+    Args: px (p, 2) pixels of it; depth (p,) inverse depths; matches (k of them); j_from_i (m, 4, 4);
+        g (6,) intrinsics; kernel_px scale of the Cauchy kernel.
+    Returns: H (m, 12, 12), b (m, 12), E (k, 12) = w J^T J_d, H_dd (p,), b_d (p,), cost (m,).
     """
-    m, p = weight.shape
+    first, point, target, weight = matches.first, matches.point, matches.target, matches.weight
+    m, p = len(first) - 1, px.shape[0]
     fold = fold_radius(g[1], g[4], g[5])
     hess = np.zeros((m, N_COLS, N_COLS))
     rhs = np.zeros((m, N_COLS))
-    cross = np.zeros((m, p, N_COLS), np.float32)
-    hdd = np.zeros((m, p))
-    bd = np.zeros((m, p))
+    cross = np.zeros((len(point), N_COLS), np.float32)
+    hdd = np.zeros(p)
+    bd = np.zeros(p)
     cost = np.zeros(m)
     c2 = kernel_px * kernel_px
     for e in range(m):
         jac = np.zeros((2, N_COLS))
-        for n in range(p):
-            w = weight[e, n]
-            if w <= 0.0:
-                continue
+        for s in range(first[e], first[e + 1]):
+            w, n = weight[s], point[s]
             rx, ry, jd0, jd1, yz = _edge_point(
-                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, fold, jac
+                px[n, 0], px[n, 1], depth[n], target[s, 0], target[s, 1], j_from_i[e], g, fold, jac
             )
             if yz < MIN_DEPTH:
                 cost[e] += w * c2 * 4.0
@@ -244,13 +295,13 @@ def anchor_system(
             r2 = rx * rx + ry * ry
             cost[e] += w * c2 * math.log1p(r2 / c2)
             w = w / (1.0 + r2 / c2)
-            hdd[e, n] = w * (jd0 * jd0 + jd1 * jd1)
-            bd[e, n] = w * (jd0 * rx + jd1 * ry)
+            hdd[n] += w * (jd0 * jd0 + jd1 * jd1)
+            bd[n] += w * (jd0 * rx + jd1 * ry)
             for i in range(N_COLS):
                 wi0 = w * jac[0, i]
                 wi1 = w * jac[1, i]
                 rhs[e, i] += wi0 * rx + wi1 * ry
-                cross[e, n, i] = wi0 * jd0 + wi1 * jd1
+                cross[s, i] = wi0 * jd0 + wi1 * jd1
                 for j in range(i, N_COLS):
                     hess[e, i, j] += wi0 * jac[0, j] + wi1 * jac[1, j]
         for i in range(N_COLS):
@@ -260,47 +311,23 @@ def anchor_system(
 
 
 @nb.njit(**_JIT)
-def anchor_columns(cross: Array, to_anchor: Array) -> Array:
-    """(p, 12 + 6 m) of one anchor keyframe: ``cross`` (m, p, 12) of its edges, in other columns.
-
-    They are [pose i, pose j1 … jm, intrinsics]. ``to_anchor`` (m, 6, 6): pose i's columns are those of pose j times it.
-    """
-    m, p = cross.shape[0], cross.shape[1]
-    out = np.zeros((p, 6 + 6 * m + N_GLOBAL))
-    last = 6 + 6 * m
-    for e in range(m):
-        for n in range(p):
-            for c in range(6):
-                v = cross[e, n, c]
-                if v != 0.0:
-                    out[n, 6 + 6 * e + c] = v
-                    for i in range(6):
-                        out[n, i] += v * to_anchor[e, c, i]
-            for c in range(N_GLOBAL):
-                out[n, last + c] += cross[e, n, 6 + c]
-    return out
-
-
-@nb.njit(**_JIT)
-def anchor_cost(
-    px: Array, depth: Array, target: Array, weight: Array, j_from_i: Array, g: Array, kernel_px: float
-) -> Array:
+def anchor_cost(px: Array, depth: Array, matches: AnchorMatches, j_from_i: Array, g: Array, kernel_px: float) -> Array:
     """The robust cost (m,) of ``anchor_system`` alone, for accepting or refusing a step."""
-    m, p = weight.shape
+    first, point, target, weight = matches.first, matches.point, matches.target, matches.weight
+    m = len(first) - 1
     f, fold = math.exp(g[0]), fold_radius(g[1], g[4], g[5])
     cost = np.zeros(m)
     c2 = kernel_px * kernel_px
     for e in range(m):
-        for n in range(p):
-            if weight[e, n] <= 0.0:
-                continue
+        for s in range(first[e], first[e + 1]):
+            n = point[s]
             rx, ry, yz = _edge_residual(
-                px[n, 0], px[n, 1], depth[n], target[e, n, 0], target[e, n, 1], j_from_i[e], g, f, fold
+                px[n, 0], px[n, 1], depth[n], target[s, 0], target[s, 1], j_from_i[e], g, f, fold
             )
             if yz < MIN_DEPTH:
-                cost[e] += weight[e, n] * c2 * 4.0
+                cost[e] += weight[s] * c2 * 4.0
             else:
-                cost[e] += weight[e, n] * c2 * math.log1p((rx * rx + ry * ry) / c2)
+                cost[e] += weight[s] * c2 * math.log1p((rx * rx + ry * ry) / c2)
     return cost
 
 

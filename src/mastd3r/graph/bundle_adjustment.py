@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from ..concurrency import on_two_threads
 from ..geometry.least_squares import Damping, damped_solve, levenberg_marquardt
-from ..geometry.reprojection_kernels import N_COLS, N_GLOBAL, anchor_columns, anchor_cost, anchor_system
+from ..geometry.reprojection_kernels import N_GLOBAL, AnchorMatches, anchor_cost, anchor_system
+from ..geometry.schur_kernels import depth_steps, eliminate, local_system
 from ..geometry.se3 import adjoint, inverse, se3_exp
 from .factors import Factors, ReprojectionFactor, Variables
 from .intrinsics import Intrinsics
@@ -83,7 +84,8 @@ class _AnchorTerm:
     """What one anchor keyframe contributes in one iteration, kept for the back-substitution."""
 
     blocks: Array  # block of each six local columns, -1 = fixed
-    cross: Array | None  # (p, n) E; None where it is made once more when it is needed
+    cross: Array | None  # (k, 12) E of its matches; None where it is made once more when it is needed
+    to_anchor: Array  # (m, 6, 6)
     hdd: Array
     bd: Array
     depth_info: Array  # (p,) hdd without the prior
@@ -107,6 +109,7 @@ class _Problem:
         self.block_of = {k: n for n, k in enumerate(k for k in variables if k not in fixed)}
         self.lens = len(self.block_of)  # the last block
         self.terms: dict[int, _AnchorTerm] = {}
+        self._matches: dict[int, AnchorMatches] = {}
         self.pattern: BlockPattern | None = None
         if self.lens >= DENSE_MOST:
             groups = [self.blocks_of(i) for i in self.by_anchor]
@@ -116,6 +119,16 @@ class _Problem:
         """(m + 2,) blocks of an anchor keyframe, of those that it is matched with, and of the lens; -1 = fixed."""
         ends = (self.block_of.get(k, -1) for k in (i, *(edge.j for edge in self.by_anchor[i])))
         return np.array([*ends, self.lens])
+
+    def matches(self, i: int) -> AnchorMatches:
+        """Those of an anchor keyframe; of a long video they are not kept, but made whenever they are asked for."""
+        found = self._matches.get(i)
+        if found is None:
+            edges = self.by_anchor[i]
+            found = AnchorMatches.of([e.target for e in edges], [e.weight for e in edges])
+            if self.pattern is None:
+                self._matches[i] = found
+        return found
 
     def parts(self) -> Iterator[list[int]]:
         """The anchor keyframes, some at a time: what they contribute is not held for all of them at once."""
@@ -140,16 +153,9 @@ class _Estimate:
         rhs = np.zeros(6 * (problem.lens + 1))
         total, held = self._prior_cost(), ~intrinsics.free
         for some in problem.parts():
-            for i, (term, whole_h, whole_b, cost) in zip(some, on_two_threads(self._anchor_part, some), strict=True):
+            for i, (term, local_h, local_b, cost) in zip(some, on_two_threads(self._anchor_part, some), strict=True):
                 total += cost
                 problem.terms[i] = term
-                # here and not beside: BLAS has threads of its own, and may split a product by what else is asked of it
-                assert term.cross is not None
-                seen = term.depth_info > 0  # the rows of other points are zero
-                root = 1 / np.sqrt(term.hdd[seen])
-                scaled = term.cross[seen] * root[:, None]
-                local_h = whole_h - scaled.T @ scaled
-                local_b = whole_b - scaled.T @ (term.bd[seen] * root)
                 local_h[-N_GLOBAL:][held], local_h[:, -N_GLOBAL:][:, held], local_b[-N_GLOBAL:][held] = 0.0, 0.0, 0.0
                 moves = term.blocks >= 0
                 keep = np.repeat(moves, 6)
@@ -167,8 +173,8 @@ class _Estimate:
         problem = self.problem
 
         def one(i: int) -> float:
-            matches, px = self._matches(i), problem.variables[i].px
-            return float(anchor_cost(px, self.depths[i], *matches, self.g, problem.kernel_px).sum())
+            given = problem.variables[i].px, self.depths[i], problem.matches(i), self._j_from_i(i)
+            return float(anchor_cost(*given, self.g, problem.kernel_px).sum())
 
         return self._prior_cost() + sum(on_two_threads(one, list(problem.by_anchor)))
 
@@ -190,29 +196,25 @@ class _Estimate:
         term = self.problem.terms[i]
         cross = self._anchor_part(i)[0].cross if term.cross is None else term.cross
         local = np.where(term.blocks[:, None] >= 0, of_block[term.blocks], 0.0).reshape(-1)
-        delta: Array = (term.bd - cross @ local) / term.hdd
-        return delta
+        found: Array = depth_steps(local, cross, self.problem.matches(i), term.to_anchor, term.hdd, term.bd)
+        return found
 
-    def _matches(self, i: int) -> tuple[Array, Array, Array]:
-        """Targets (m, p, 2), weights (m, p) and j_from_i (m, 4, 4) of an anchor keyframe's edges."""
-        edges, world_from_anchor = self.problem.by_anchor[i], inverse(self.poses[i])
-        j_from_i = np.stack([self.poses[e.j] @ world_from_anchor for e in edges])
-        return (
-            np.stack([e.target for e in edges], dtype=float),
-            np.stack([e.weight for e in edges], dtype=float),
-            j_from_i,
-        )
+    def _j_from_i(self, i: int) -> Array:
+        """(m, 4, 4) of an anchor keyframe's edges."""
+        world_from_anchor = inverse(self.poses[i])
+        return np.stack([self.poses[e.j] @ world_from_anchor for e in self.problem.by_anchor[i]])
 
     def _anchor_part(self, i: int) -> tuple[_AnchorTerm, Array, Array, float]:
-        """What an anchor keyframe's depths are eliminated with, its part of the system before that, its cost."""
+        """What an anchor keyframe's depths are eliminated with, its part of the system without them, its cost."""
         problem, v, depth = self.problem, self.problem.variables[i], self.depths[i]
-        target, weight, j_from_i = self._matches(i)
-        h, b, e, hdd, bd, cost = anchor_system(v.px, depth, target, weight, j_from_i, self.g, problem.kernel_px)
-        depth_info = hdd.sum(0)
-        hdd_i = depth_info + v.prior_info + 1e-9
-        bd_i = bd.sum(0) + v.prior_info * (v.prior_depth - depth)
-        local_h, local_b, cross = _anchor_local(h, b, e, j_from_i)
-        term = _AnchorTerm(problem.blocks_of(i), cross, hdd_i, bd_i, depth_info)
+        matches, j_from_i = problem.matches(i), self._j_from_i(i)
+        h, b, cross, depth_info, bd, cost = anchor_system(v.px, depth, matches, j_from_i, self.g, problem.kernel_px)
+        hdd = depth_info + v.prior_info + 1e-9
+        bd += v.prior_info * (v.prior_depth - depth)
+        to_anchor = -np.stack([adjoint(t) for t in j_from_i])  # J_i = -J_j Ad(j_from_i)
+        local_h, local_b = local_system(h, b, to_anchor)
+        eliminate(local_h, local_b, cross, matches, to_anchor, hdd, bd)
+        term = _AnchorTerm(problem.blocks_of(i), cross, to_anchor, hdd, bd, depth_info)
         return term, local_h, local_b, float(cost.sum())
 
     def _prior_cost(self) -> float:
@@ -242,27 +244,6 @@ def _facing_scene(end: _Estimate, anchors: list[int], still: int) -> tuple[dict[
 
 def _typical(inv_depth: Array) -> float:
     return float(np.abs(inv_depth).mean())
-
-
-def _anchor_local(h: Array, b: Array, e: Array, j_from_i: Array) -> tuple[Array, Array, Array]:
-    """Rewrite per-edge parts in the columns [pose i, pose j1 … jm, intrinsics]: J_i = -J_j Ad(j_from_i)."""
-    m, n = len(h), 6 + 6 * len(h) + N_GLOBAL
-    to_local = np.zeros((m, N_COLS, 6 + N_COLS))  # from [pose j, intrinsics] to [pose i, pose j, intrinsics]
-    to_local[:, :, 6:] = np.eye(N_COLS)
-    to_local[:, :6, :6] = [-adjoint(t) for t in j_from_i]
-    part = to_local.transpose(0, 2, 1) @ h @ to_local
-    part_b = (b[:, None] @ to_local)[:, 0]
-    hess, rhs = np.zeros((n, n)), np.zeros(n)
-    ends, edge = slice(6, 6 + 6 * m), np.arange(m)
-    i, j, g = slice(0, 6), slice(6, 12), slice(12, None)  # in a part
-    last = slice(n - N_GLOBAL, n)
-    hess[i, i], hess[i, last], hess[last, last] = (part[:, r, c].sum(0) for r, c in ((i, i), (i, g), (g, g)))
-    hess[i, ends] = part[:, i, j].transpose(1, 0, 2).reshape(6, 6 * m)
-    hess[ends, last] = part[:, j, g].reshape(6 * m, N_GLOBAL)
-    hess[ends, ends].reshape(m, 6, m, 6)[edge, :, edge] = part[:, j, j]
-    hess[ends, i], hess[last, i], hess[last, ends] = hess[i, ends].T, hess[i, last].T, hess[ends, last].T
-    rhs[i], rhs[ends], rhs[last] = part_b[:, i].sum(0), part_b[:, j].reshape(-1), part_b[:, g].sum(0)
-    return hess, rhs, anchor_columns(e, np.ascontiguousarray(to_local[:, :6, :6]))
 
 
 def _lens_covariance(hess: Any) -> Array | None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..alignment.reproject import StaticMatches, solve_pose
+from ..concurrency import on_two_threads
 from ..config import Config
 from ..errors import InputError
 from ..geometry.se3 import interpolate, inverse
@@ -108,19 +111,28 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
 
     A frame whose matches hardly agree with the pose that they give is a lost one, too.
     """
+    passages = [list(some) for _, some in itertools.groupby(graph.records, lambda r: r.kf_id)]
     out: list[FinalFrame] = []
-    guess, kf_before = np.eye(4), -1
-    for record in graph.records:
-        guess = guess if record.kf_id == kf_before else np.eye(4)
-        kf_before = record.kf_id
-        if record.state == "lost":
-            out.append(FinalFrame(record, np.full((4, 4), np.nan), "lost"))
-            continue
-        guess = np.eye(4) if record.is_keyframe else _refined(graph, record, guess)
-        graph.set_record_pose(record, guess)
-        cam_from_world = guess @ graph.variables[record.kf_id].cam_from_world
-        out.append(FinalFrame(record, inverse(cam_from_world), record.state))
+    for some, poses in zip(passages, on_two_threads(partial(_refined_all, graph), passages), strict=True):
+        for record, cam_from_kf in zip(some, poses, strict=True):
+            if cam_from_kf is None:
+                out.append(FinalFrame(record, np.full((4, 4), np.nan), "lost"))
+                continue
+            graph.set_record_pose(record, cam_from_kf)
+            cam_from_world = cam_from_kf @ graph.variables[record.kf_id].cam_from_world
+            out.append(FinalFrame(record, inverse(cam_from_world), record.state))
     return _bridged(_without_unsupported(graph, out))
+
+
+def _refined_all(graph: KeyframeGraph, records: list[FrameRecord]) -> list[Array | None]:
+    """Poses from the keyframe that one frame after the other was tracked from; None where a frame is lost."""
+    poses: list[Array | None] = []
+    guess = np.eye(4)
+    for record in records:
+        if record.state != "lost":
+            guess = np.eye(4) if record.is_keyframe else _refined(graph, record, guess)
+        poses.append(guess if record.state != "lost" else None)
+    return poses
 
 
 def _without_unsupported(graph: KeyframeGraph, frames: list[FinalFrame]) -> list[FinalFrame]:

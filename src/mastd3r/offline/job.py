@@ -240,7 +240,8 @@ class RunJob:
     def report(self) -> None:
         """Figures against the truth, where there is one, and the report."""
         elapsed = time.perf_counter() - self._began
-        evaluation = evaluate(self.folder.path, self.source.truth(), self.source.frames())
+        times_s = np.array([f.record.timestamp_s for f in self._final])
+        evaluation = evaluate(self.folder.path, self.source.truth(), self.source.frames(), times_s)
         states = Counter("tracked" if f.state == "started" else f.state for f in self._final)
         self.metrics = {
             **evaluation.metrics,
