@@ -2,7 +2,8 @@
 
 A camera that walks changes its speed, and looks at what is near and far. Where both its speed and the depth of what it
 sees are suddenly many times what they were, it is the unit of length that has changed: few matches went through, as at
-a fast turn with somebody in front. The solver does not leave such a minimum, though the true one costs less.
+a fast turn with somebody in front. The solver does not leave such a minimum, though the true one costs less; or the
+matches tell of no scale at all, and then the one that goes on as before is the likelier.
 """
 
 from __future__ import annotations
@@ -23,14 +24,14 @@ log = logging.getLogger(__name__)
 SPAN, LEAST_SPAN = 6, 2  # keyframes on either side, whose speed and depth are compared, and at least
 JUMP = 2.0  # times, that both change: another scale is tried
 MOST_TRIED = 3  # jumps, the largest first
-BETTER = 0.998  # of the cost, for another scale to be taken
+UNTOLD = 25.0  # more of the cost, up to which matches do not tell one scale from another: half a dozen that fit neither
 
 
 def mend_scale_jumps(graph: KeyframeGraph) -> int:
     """Try the scale before a jump for what follows it, in the submap being tracked; how often it was taken.
 
     Where a later jump leads back, what lies between the two is tried by itself first: the rest may hang together by
-    other views. Another scale is taken where the whole chain costs less. None is tried where depths are measured.
+    other views. The scale before is taken unless the whole chain costs more so. None is tried where depths are measured.
     """
     taken, tried = 0, set[int]()
     while len(tried) < MOST_TRIED and not graph.depths_measured:
@@ -83,7 +84,7 @@ def scale_jumps(graph: KeyframeGraph) -> list[tuple[int, float]]:
 
 
 def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = None) -> bool:
-    """Bring a keyframe, and what follows it, to the scale before, if the whole chain costs less so; whether it does.
+    """Bring a keyframe, and what follows it, to the scale before, unless the whole chain costs more; whether it was.
 
     ``end``: the first keyframe that stays; default: none.
     """
@@ -94,11 +95,11 @@ def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = 
     there = Sim3(np.eye(3), centre - centre / ratio, 1 / ratio)
     graph.transform_keyframes(after, there)
     now = cost_around(graph, around)
-    better = now < BETTER * before
+    taken = now < before + UNTOLD
     frames = [graph.keyframes[k].work.index for k in (kf_id, after[-1])]
     log.info("frames %d to %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
-             *frames, ratio, before, now, "taken" if better else "left")  # fmt: skip
-    if not better:
+             *frames, ratio, before, now, "taken" if taken else "left")  # fmt: skip
+    if not taken:
         graph.transform_keyframes(after, there.inverse())  # the priors of depths, and the frames that hang on them
         put_back(graph, kept, lens)
-    return better
+    return taken
