@@ -31,7 +31,8 @@ def mend_scale_jumps(graph: KeyframeGraph) -> int:
     """Try the scale before a jump for what follows it, in the submap being tracked; how often it was taken.
 
     Where a later jump leads back, what lies between the two is tried by itself first: the rest may hang together by
-    other views. The scale before is taken unless the whole chain costs more so. None is tried where depths are measured.
+    other views. The scale before is taken unless the whole chain costs more so. None is tried where depths are
+    measured.
     """
     taken, tried = 0, set[int]()
     while len(tried) < MOST_TRIED and not graph.depths_measured:
