@@ -229,3 +229,15 @@ def test_a_run_that_wrote_no_pictures_is_scored(tmp_path: Path, sequence: Sequen
     metrics = evaluate_run(path, sequence.truth, sequence.frames())
     assert (metrics["frames"], metrics["frames_posed"], metrics["ate_rmse_all"]) == (N, 0, None)
     assert "got 0" in metrics["ate_rmse_all_note"]
+
+
+def test_without_renders_no_photograph_is_read(run: RunFolder, sequence: Sequence) -> None:
+    for old in (run.path / "renders").glob("*.png"):
+        old.unlink()
+
+    def refused() -> Iterator[Frame]:
+        raise AssertionError("a photograph was asked for")
+        yield  # a generator
+
+    whole = evaluate_run(run.path, sequence.truth, sequence.frames())
+    assert evaluate_run(run.path, sequence.truth, refused(), sequence.times_s) == whole
