@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 SPAN, LEAST_SPAN = 6, 2  # keyframes on either side, whose speed and depth are compared, and at least
 JUMP = 2.0  # times, that both change: another scale is tried
 MOST_TRIED = 3  # jumps, the largest first
-UNTOLD = 25.0  # more of the cost, up to which matches do not tell one scale from another: half a dozen that fit neither
+UNTOLD = 25.0  # more of the cost, up to which matches do not tell: as much as half a dozen that are some pixels off
 
 
 def mend_scale_jumps(graph: KeyframeGraph) -> int:
