@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..concurrency import Future
+from ..concurrency import Future, give_back_memory
 from ..dynamics.soft_mask import static_at
 from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
@@ -41,6 +41,7 @@ SEEN_TOGETHER = 0.5  # rad between two views that may see the same
 LONG_BEFORE = 8  # keyframes; those nearer are matched as neighbours
 COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
 COVISIBLE_PAIRS = 4  # of those for each keyframe, at most
+MANY = 500  # keyframes: beside the system of so many, what places look like is forgotten until it is asked for again
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,9 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
                 doubted.append(seen)
     voted = _voted_for(graph, doubted)
     found += voted
+    if len(graph.keyframes) >= MANY:
+        getattr(two_view.parts.features, "forget", lambda: None)()
+        give_back_memory()
     _close(graph, found)
     if voted:  # the ends of what was badly explained have moved far
         retake_passages(graph)
