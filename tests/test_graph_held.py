@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse, se3_exp
 from mastd3r.geometry.sim3 import Sim3
+from mastd3r.graph.bridging import bridge_submaps
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
-from mastd3r.graph.submaps import bridge_submaps, join
+from mastd3r.graph.submaps import join
 
 Array = NDArray[Any]
 
@@ -24,7 +25,7 @@ Array = NDArray[Any]
 def held_graph(scene: Any, held: int, video_from_map: Array) -> KeyframeGraph:
     """Keyframes 0 … held of a map, the rest of a video that has a world of its own; edges within each."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(steady_speed=0.0), intrinsics_for(CameraConfig(), *size, size))
     graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
     ones = np.ones(len(scene.px))
     for k in range(len(scene.cam_from_world)):

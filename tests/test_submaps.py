@@ -17,7 +17,7 @@ from mastd3r.geometry.se3 import inverse, se3_exp, se3_log, transform
 from mastd3r.geometry.sim3 import Sim3, procrustes
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.submaps import bridge_submaps, join, with_scale
+from mastd3r.graph.submaps import join, with_scale
 from mastd3r.offline.final_solve import FinalFrame, final_frames, finish_graph
 from mastd3r.parts import Parts, build_parts
 from mastd3r.slam import Slam, TrackResult
@@ -54,7 +54,7 @@ def keyframe(
 def cut_graph(scene: Any, scale: float = SCALE, b_from_a: Array = B_FROM_A) -> KeyframeGraph:
     """True keyframes 0 … 4 in one world, 5 … 9 in another one with lengths of its own; a frame hangs on 2 and on 7."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(steady_speed=0.0), intrinsics_for(CameraConfig(), *size, size))
     graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
     for k in range(VIEWS):
         if k == CUT:
@@ -192,64 +192,6 @@ def test_dropping_the_newest_submap_leaves_contiguous_numbers(scene: Any) -> Non
     assert graph.submap == 1
     k = keyframe(graph, scene, 5, 1.0, np.eye(4), 1 / scene.depth(5))
     assert k == CUT and graph.submap_of[k] == 1 and graph.members() == [k]
-
-
-def steady(k: float) -> Array:
-    """world_from_cam of a camera that moves and turns at constant velocity."""
-    return inverse(se3_exp(k * np.array([0.05, 0.01, -0.02, 0.0, 0.03, 0.01])))
-
-
-def steady_graph(scene: Any, gap: int) -> KeyframeGraph:
-    """Keyframes 0 … 9 of a steady camera, ``gap`` frames missing after the fifth; the rest is in a world of its own."""
-    size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
-    graph.intrinsics.values = scene.lens.copy()
-    inv_depth = np.full(len(scene.px), 0.4)
-    for k in range(VIEWS):
-        if k == CUT:
-            graph.start_submap()
-        at = k + gap if k >= CUT else k
-        pose = inverse(steady(at))
-        if k >= CUT:
-            pose = pose @ inverse(B_FROM_A)
-            pose[:3, 3] /= SCALE
-        keyframe(graph, scene, k, at / 30, pose, inv_depth * (SCALE if k >= CUT else 1.0))
-        graph.started.add(graph.submap)
-    return graph
-
-
-@pytest.mark.parametrize("gap", [0, 3, 9])
-def test_a_submap_never_joined_is_placed_by_continuity(scene: Any, gap: int) -> None:
-    """Constant velocity and the same depth on both sides of the gap: exactly where the camera was."""
-    graph = steady_graph(scene, gap)
-    assert bridge_submaps(graph) == [(5, 9)]
-    for k in range(VIEWS):
-        at = k + gap if k >= CUT else k
-        np.testing.assert_allclose(graph.world_from_cam(k), steady(at), atol=1e-6)
-    assert [r.state for r in graph.records] == ["tracked"] * 5 + ["interpolated"] * 5
-    assert set(graph.submap_of.values()) == {0} and graph.started == {0}
-    assert bridge_submaps(graph) == []
-
-
-def test_velocity_is_not_believed_for_long(scene: Any) -> None:
-    """After a gap of a hundred frames the camera is guessed three spans of the velocity ahead, no more."""
-    graph = steady_graph(scene, 100)
-    bridge_submaps(graph)
-    ahead = np.linalg.norm(se3_log(inverse(steady(4)) @ graph.world_from_cam(5)))
-    assert ahead == pytest.approx(3 * np.linalg.norm(se3_log(inverse(steady(0)) @ steady(4))), rel=1e-6)
-
-
-def test_three_submaps_are_bridged_one_after_another(scene: Any) -> None:
-    graph = steady_graph(scene, 2)
-    graph.start_submap()
-    for k in range(3):
-        pose = inverse(steady(12 + k) @ inverse(steady(12)))
-        pose[:3, 3] *= 0.2
-        keyframe(graph, scene, 0, (12 + k) / 30, pose, np.full(len(scene.px), 0.4 / 0.2))
-    graph.started.add(graph.submap)
-    assert len(bridge_submaps(graph)) == 2
-    for k in range(3):
-        np.testing.assert_allclose(graph.world_from_cam(10 + k), steady(12 + k), atol=1e-6)
 
 
 # -- whole runs ----------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..concurrency import on_two_threads
+from ..concurrency import give_back_memory, on_two_threads
 from ..geometry.least_squares import Damping, damped_solve, levenberg_marquardt
 from ..geometry.reprojection_kernels import N_GLOBAL, AnchorMatches, anchor_cost, anchor_system
 from ..geometry.schur_kernels import depth_steps, eliminate, local_system
@@ -21,6 +21,7 @@ from ..geometry.se3 import adjoint, inverse, se3_exp
 from .factors import Factors, ReprojectionFactor, Variables
 from .intrinsics import Intrinsics
 from .normal_equations import DENSE_MOST, BlockPattern, DenseEquations, SparseEquations, unknowns
+from .steady_speed import SteadySpeed
 
 Array = NDArray[Any]
 AT_INFINITY = 1e-6  # of an anchor's typical inverse depth: that of a point beyond infinity once all is solved
@@ -50,14 +51,16 @@ def solve(
     iterations: int,
     kernel_px: float = 1.0,
     tolerance: float = 1e-4,
+    speed: SteadySpeed | None = None,
 ) -> SolveReport:
     """Optimise in place. Poses in ``fixed`` stay; every anchor keyframe's depths and the free intrinsics move.
 
     Stops when the relative decrease of the robust cost is below ``tolerance``. A singular system or an
     exhausted damping ends the loop with ``converged=False``. Meanwhile inverse depths may fall below 0: noise moves
     points at infinity to both sides, and where they may go to one only, the lens makes up for it, or no step is good.
+    ``speed``: what is asked of keyframes in a row.
     """
-    problem = _Problem(variables, edges, intrinsics, fixed, kernel_px)
+    problem = _Problem(variables, edges, intrinsics, fixed, kernel_px, speed)
     poses = {k: v.cam_from_world for k, v in variables.items()}
     start = _Estimate(problem, poses, {k: v.inv_depth for k, v in variables.items()}, intrinsics.values)
     found = levenberg_marquardt(start, DAMPING, iterations=iterations, tolerance=tolerance)
@@ -101,6 +104,7 @@ class _Problem:
         intrinsics: Intrinsics,
         fixed: frozenset[int],
         kernel_px: float,
+        speed: SteadySpeed | None,
     ) -> None:
         self.variables, self.intrinsics, self.kernel_px = variables, intrinsics, kernel_px
         self.by_anchor: Factors = {}
@@ -108,11 +112,14 @@ class _Problem:
             self.by_anchor.setdefault(edge.i, []).append(edge)
         self.block_of = {k: n for n, k in enumerate(k for k in variables if k not in fixed)}
         self.lens = len(self.block_of)  # the last block
+        self.speed = speed if speed is not None and len(speed.ids) else None
+        rows = () if self.speed is None else self.speed.ids.tolist()
+        self.in_a_row = [np.array([self.block_of.get(k, -1) for k in row]) for row in rows]
         self.terms: dict[int, _AnchorTerm] = {}
         self._matches: dict[int, AnchorMatches] = {}
         self.pattern: BlockPattern | None = None
         if self.lens >= DENSE_MOST:
-            groups = [self.blocks_of(i) for i in self.by_anchor]
+            groups = [*(self.blocks_of(i) for i in self.by_anchor), *self.in_a_row]
             self.pattern = BlockPattern(self.lens + 1, [g[g >= 0] for g in groups])
 
     def blocks_of(self, i: int) -> Array:
@@ -157,15 +164,17 @@ class _Estimate:
                 total += cost
                 problem.terms[i] = term
                 local_h[-N_GLOBAL:][held], local_h[:, -N_GLOBAL:][:, held], local_b[-N_GLOBAL:][held] = 0.0, 0.0, 0.0
-                moves = term.blocks >= 0
-                keep = np.repeat(moves, 6)
-                equations.add(term.blocks[moves], local_h[np.ix_(keep, keep)])
-                np.add.at(rhs, unknowns(term.blocks[moves]), local_b[keep])
+                _add(equations, rhs, term.blocks, local_h, local_b)
                 if pattern is not None:
                     term.cross = None
+        if problem.speed is not None:
+            for blocks, part_h, part_b in zip(problem.in_a_row, *problem.speed.system(self.poses), strict=True):
+                _add(equations, rhs, blocks, part_h, part_b)
         prior_info = np.where(held, 0.0, intrinsics.prior_info)
         equations.add(np.array([problem.lens]), np.diag(prior_info))
         rhs[-N_GLOBAL:] += prior_info * (intrinsics.prior - self.g)
+        if pattern is not None:
+            give_back_memory()  # what the parts were made in, before the system is factorised
         return equations.matrix(), rhs, total
 
     def cost(self) -> float:
@@ -221,10 +230,19 @@ class _Estimate:
         variables, intrinsics = self.problem.variables, self.problem.intrinsics
         free = intrinsics.free
         total = float((intrinsics.prior_info[free] * (self.g - intrinsics.prior)[free] ** 2).sum())
+        total += 0.0 if self.problem.speed is None else self.problem.speed.cost(self.poses)
         for i in self.problem.by_anchor:
             v = variables[i]
             total += float((v.prior_info * (self.depths[i] - v.prior_depth) ** 2).sum())
         return total
+
+
+def _add(equations: DenseEquations | SparseEquations, rhs: Array, blocks: Array, part_h: Array, part_b: Array) -> None:
+    """Add a part (6 k, 6 k) and (6 k,) of the system, of ``blocks`` (k,); -1 = fixed."""
+    moves = blocks >= 0
+    keep = np.repeat(moves, 6)
+    equations.add(blocks[moves], part_h[np.ix_(keep, keep)])
+    np.add.at(rhs, unknowns(blocks[moves]), part_b[keep])
 
 
 def _facing_scene(end: _Estimate, anchors: list[int], still: int) -> tuple[dict[int, Array], dict[int, Array]]:

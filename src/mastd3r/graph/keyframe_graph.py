@@ -21,7 +21,7 @@ from ..types import USABLE_WEIGHT, Matches, State, WorkFrame
 from .bundle_adjustment import SolveReport, solve
 from .factors import KeyframeVariables, ReprojectionFactor, no_matches, strongest
 from .intrinsics import Intrinsics, believing, camera_of
-from .windows import Window, depths_of, everything, sliding
+from .windows import Window, depths_of, everything, in_a_row, sliding
 
 Array = NDArray[Any]
 
@@ -360,15 +360,15 @@ class KeyframeGraph:
     ) -> SolveReport:
         """Joint optimisation of a part of the graph; see ``bundle_adjustment.solve``."""
         intrinsics = replace(self.intrinsics, prior_info=problem.prior_info(self.intrinsics))
-        variables = {k: self.variables[k] for k in problem.ids}
         report = solve(
-            variables,
+            {k: self.variables[k] for k in problem.ids},
             problem.edges,
             intrinsics,
             fixed=problem.fixed,
             iterations=iterations,
             kernel_px=kernel_px,
             tolerance=tolerance,
+            speed=in_a_row(self, problem),
         )
         self.intrinsics = replace(self.intrinsics, values=intrinsics.values)
         return report

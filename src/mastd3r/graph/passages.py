@@ -166,9 +166,10 @@ def thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
 
 def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     """The cost after steps of (kernel in pixels, iterations), the first keyframe held."""
-    cost = np.inf
+    cost, still = np.inf, frozenset([min(part.variables)])
     for kernel_px, iterations in steps:
-        window = Window(list(part.variables), part.edges, frozenset([min(part.variables)]), ALL_INTRINSICS)
+        steady = kernel_px <= KERNEL_PX  # not of a start, where all may be at one place
+        window = Window(list(part.variables), part.edges, still, ALL_INTRINSICS, steady)
         cost = part.optimise(window, iterations, kernel_px).cost_last
     return cost
 
@@ -184,7 +185,7 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     first, last = members.index(ids[0]), members.index(ids[-1])
     around = members[max(first - AROUND, 0) : last + AROUND + 1]
     still = frozenset([around[0], *(k for k in around if k < graph.held)])
-    window = Window(around, graph.edges_among(around), still, ALL_INTRINSICS)
+    window = Window(around, graph.edges_among(around), still, ALL_INTRINSICS, steady=True)
     old_end = graph.variables[around[-1]].cam_from_world
     cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in WHOLE][-1].cost_last
     moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end

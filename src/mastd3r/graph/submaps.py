@@ -8,15 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.se3 import inverse, se3_exp, se3_log
 from ..geometry.sim3 import Sim3
 from ..types import USABLE_WEIGHT, Matches
 from .depth import depth_confidence
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
-VELOCITY_FRAMES = 6  # over how many frames a velocity is taken
-MOST_AHEAD = 3.0  # for how many times that span it is believed
 MIN_COMMON = 20  # matches whose depth is known on both sides, for a scale
 
 
@@ -65,34 +62,3 @@ def bring(graph: KeyframeGraph, gone: int, keep: int, keep_from_gone: Sim3) -> N
     graph.started.discard(gone)
     if graph.submap == gone:
         graph.submap = keep
-
-
-def bridge_submaps(graph: KeyframeGraph) -> list[tuple[int, int]]:
-    """Place submaps that were never recognised where the camera would have gone: (first, last) frame of each.
-
-    Constant velocity over the gap, and the same median depth on both sides of it. Such poses are guesses, so the
-    frames' state becomes "interpolated".
-    """
-    out = []
-    for submap in sorted(set(graph.submap_of.values()))[1:]:
-        ids = set(graph.members(submap))
-        own = [n for n, r in enumerate(graph.records) if r.kf_id in ids and r.state != "lost"]
-        for n in own:
-            graph.set_record_state(graph.records[n], "interpolated")
-        out.append((graph.records[own[0]].index, graph.records[own[-1]].index))
-        rest = [r for r in graph.records[: own[0]] if r.kf_id not in ids and r.state != "lost"]
-        end = graph.records[own[0]]
-        if not rest:  # the video began outside of a saved map: back from where it was found there
-            rest = [r for r in reversed(graph.records[own[-1] + 1 :]) if r.kf_id not in ids and r.state != "lost"]
-            end = graph.records[own[-1]]
-        if not rest:
-            continue
-        near, past = rest[-1], rest[-min(len(rest), VELOCITY_FRAMES)]
-        now, then = (r.cam_from_kf @ graph.variables[r.kf_id].cam_from_world for r in (near, past))
-        span_s = max(abs(near.timestamp_s - past.timestamp_s), 1e-9)
-        ahead = min(abs(end.timestamp_s - near.timestamp_s) / span_s, MOST_AHEAD)
-        guess = se3_exp(ahead * se3_log(now @ inverse(then))) @ now
-        i, j = near.kf_id, end.kf_id
-        j_from_i = Sim3.from_rigid(guess @ inverse(graph.variables[i].cam_from_world))
-        join(graph, i, j, j_from_i.in_lengths(graph.median_inv_depth(i) / graph.median_inv_depth(j)))
-    return out

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..geometry.reprojection_kernels import N_GLOBAL
 from .factors import ReprojectionFactor
 from .intrinsics import HELD_AT_FIRST, RADIAL, Intrinsics
+from .steady_speed import SteadySpeed
 
 if TYPE_CHECKING:
     from .keyframe_graph import KeyframeGraph
@@ -28,6 +29,7 @@ class Window:
     edges: list[ReprojectionFactor]  # between those
     fixed: frozenset[int]  # keyframes whose pose stays
     held: frozenset[int]  # intrinsics that stay, indices into g
+    steady: bool = False  # whether a camera's speed that goes on is the likelier where matches do not tell
 
     def prior_info(self, intrinsics: Intrinsics) -> Array:
         """(6,) information of the intrinsics' priors, inf for those that are held."""
@@ -63,7 +65,16 @@ def depths_of(graph: KeyframeGraph, kf_id: int) -> Window:
 def everything(graph: KeyframeGraph) -> Window:
     """Every keyframe; the first of each submap stays, and a saved map."""
     still = frozenset([*graph.roots(), *range(graph.held)])
-    return Window(graph.variables.keys(), graph.edges, still, _held(graph, ()))
+    return Window(graph.variables.keys(), graph.edges, still, _held(graph, ()), steady=True)
+
+
+def in_a_row(graph: KeyframeGraph, window: Window) -> SteadySpeed:
+    """What keyframes of a window that follow one another in a submap and a video ask of the camera's speed."""
+    inside = set(window.ids) if window.steady else set[int]()
+    times_s = {kf.id: kf.work.timestamp_s for kf in graph.keyframes if kf.id in inside and kf.id >= graph.held}
+    rows = [(k, k + 1, k + 2) for k in times_s if k + 1 in times_s and k + 2 in times_s]
+    alike = [row for row in rows if len({graph.submap_of[k] for k in row}) == 1]
+    return SteadySpeed.of(alike, times_s, graph.config.steady_speed)
 
 
 def _held(graph: KeyframeGraph, named: Iterable[int]) -> frozenset[int]:

@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..geometry.se3 import interpolate, inverse
 from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
+from ..graph.bridging import bridge_submaps
 from ..graph.bundle_adjustment import SolveReport
 from ..graph.initialisation import bootstrap
 from ..graph.intrinsics import RADIAL, without_radial
@@ -25,7 +26,6 @@ from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
 from ..graph.loose import AGREES_PX, FIRM_SHARE, agreeing_weights, firm_weight
 from ..graph.observability import Observability
 from ..graph.radial_terms import radial_is_told
-from ..graph.submaps import bridge_submaps
 from ..graph.turning import observed, put_at_infinity
 from ..types import State, Trajectory
 

@@ -1,0 +1,161 @@
+"""That a camera's speed goes on is believed where matches say nothing, and nowhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mastd3r.config import CameraConfig, GraphConfig
+from mastd3r.geometry.se3 import inverse, se3_exp
+from mastd3r.geometry.sim3 import Sim3
+from mastd3r.graph import bundle_adjustment
+from mastd3r.graph.intrinsics import intrinsics_for
+from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.graph.steady_speed import SteadySpeed
+from mastd3r.graph.windows import everything, in_a_row, sliding
+from test_submaps import keyframe, world_from
+
+VIEWS, FIRST, END = 14, 5, 10  # the keyframes between FIRST and END may be brought to a scale of their own
+ROWS, TIMES_S = [(0, 1, 2), (1, 2, 3)], {0: 0.0, 1: 0.3, 2: 0.5, 3: 0.9}
+
+
+def poses(centres: Any, seed: int = 0) -> dict[int, Any]:
+    """cam_from_world of cameras at ``centres`` (n, 3) that look anywhere."""
+    rng = np.random.default_rng(seed)
+    out = {}
+    for k, centre in enumerate(np.asarray(centres, float)):
+        out[k] = se3_exp(np.concatenate([np.zeros(3), rng.normal(size=3)]))
+        out[k][:3, 3] = -out[k][:3, :3] @ centre
+    return out
+
+
+def test_nothing_is_asked_of_a_camera_whose_speed_goes_on() -> None:
+    speed = SteadySpeed.of(ROWS, TIMES_S, 7.0)
+    assert speed.cost(poses([[t, 2 * t, -t] for t in TIMES_S.values()])) == pytest.approx(0, abs=1e-20)
+
+
+def test_twice_as_fast_costs_a_ninth_of_the_weight_and_turning_back_all_of_it() -> None:
+    speed = SteadySpeed.of(ROWS[:1], {0: 0.0, 1: 0.1, 2: 0.2}, 9.0)
+    assert speed.cost(poses([[0, 0, 0], [1, 0, 0], [3, 0, 0]])) == pytest.approx(1.0)
+    assert speed.cost(poses([[0, 0, 0], [1, 0, 0], [0, 0, 0]])) == pytest.approx(9.0)
+    still = poses(np.zeros((3, 3)))
+    assert speed.cost(still) == 0.0 and not speed.system(still)[0].any()
+
+
+def test_longer_gaps_weigh_less_and_none_are_left_out() -> None:
+    assert SteadySpeed.of(ROWS, {0: 0.0, 1: 0.5, 2: 1.5, 3: 3.5}, 8.0).weight.tolist() == [8.0, 2.0]
+    assert len(SteadySpeed.of(ROWS, {0: 0.0, 1: 0.5, 2: 0.5, 3: 1.0}, 8.0).ids) == 0
+    assert len(SteadySpeed.of(ROWS, TIMES_S, 0.0).ids) == 0
+    assert SteadySpeed.of([], {}, 8.0).cost({}) == 0.0
+
+
+def test_the_unit_of_length_does_not_matter() -> None:
+    speed, centres = SteadySpeed.of(ROWS, TIMES_S, 7.0), np.random.default_rng(1).normal(size=(4, 3))
+    assert speed.cost(poses(1e-3 * centres)) == pytest.approx(speed.cost(poses(centres)))
+    h, b = speed.system(poses(centres))
+    for n, row in enumerate(ROWS):
+        grows = np.concatenate([[*p[:3, 3], 0, 0, 0] for p in (poses(centres)[k] for k in row)])
+        assert abs(b[n] @ grows) < 1e-12 and abs(grows @ h[n] @ grows) < 1e-12
+
+
+def test_the_system_is_that_of_its_differences() -> None:
+    speed, at = SteadySpeed.of(ROWS, TIMES_S, 7.0), poses(np.random.default_rng(1).normal(size=(4, 3)))
+    h, b = speed.system(at)
+    for n, row in enumerate(ROWS):
+        one = replace(speed, ids=speed.ids[n : n + 1], gaps_s=speed.gaps_s[n : n + 1], weight=speed.weight[n : n + 1])
+        columns = []
+        for unit in 1e-6 * np.eye(18):
+            there, back = (
+                one._residuals(
+                    one._poses({k: se3_exp(s * unit[6 * m : 6 * m + 6]) @ at[k] for m, k in enumerate(row)})
+                )[0][0]
+                for s in (1, -1)
+            )
+            columns.append((there - back) / 2e-6)
+        jacobian, residual = np.stack(columns, axis=1), one._residuals(one._poses(at))[0][0]
+        np.testing.assert_allclose(h[n], 7.0 * jacobian.T @ jacobian, atol=1e-7)
+        np.testing.assert_allclose(b[n], -7.0 * jacobian.T @ residual, atol=1e-7)
+
+
+@pytest.fixture(scope="module")
+def scene(exact_scene: Callable[..., Any]) -> Any:
+    return exact_scene(VIEWS, step=0.08, cell_px=10)
+
+
+def chain(scene: Any, ratio: float, across: float, weight: float) -> KeyframeGraph:
+    """A camera at one speed; the keyframes from ``FIRST`` to ``END`` are ``ratio`` times as large, those after come
+    along, and matches between them and the others weigh ``across``."""
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(GraphConfig(steady_speed=weight), intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
+    for k in range(VIEWS):
+        keyframe(graph, scene, k, k / 10, inverse(world_from(scene, k)), 1 / scene.depth(k))
+        graph.variables[k].prior_info = graph.variables[k].prior_info * 1e-6
+    graph.started.add(0)
+    for i in range(VIEWS):
+        for j in range(max(i - 2, 0), min(i + 3, VIEWS)):
+            apart = (FIRST <= i < END) != (FIRST <= j < END)
+            if i != j and (not apart or across):
+                static = np.full(len(scene.px), across if apart else 1.0)
+                graph.connect(i, j, scene.matches(i, j), static, followed=True)
+    centre, end = graph.world_from_cam(FIRST)[:3, 3], graph.world_from_cam(END - 1)[:3, 3]
+    graph.transform_keyframes(range(FIRST, END), Sim3(np.eye(3), centre - ratio * centre, ratio))
+    moved = np.eye(4)
+    moved[:3, 3] = graph.world_from_cam(END - 1)[:3, 3] - end
+    graph.transform_keyframes(range(END, VIEWS), Sim3.from_rigid(moved))
+    return graph
+
+
+def steps_of(graph: KeyframeGraph) -> Any:
+    """Lengths between keyframes, of the first ones' mean."""
+    steps = np.linalg.norm(np.diff([graph.world_from_cam(k)[:3, 3] for k in range(VIEWS)], axis=0), axis=1)
+    return steps / steps[: FIRST - 1].mean()
+
+
+@pytest.mark.parametrize(("weight", "speed"), [(25.0, 1.0), (0.0, 2.0)])
+def test_a_part_that_no_match_measures_comes_out_at_the_speed_around_it(
+    scene: Any, weight: float, speed: float
+) -> None:
+    graph = chain(scene, 2.0, 0.0, weight)
+    for _ in range(8):
+        graph.solve_all(20, 1.0)
+    np.testing.assert_allclose(steps_of(graph)[FIRST : END - 1], speed, rtol=0.1)
+
+
+def test_what_matches_tell_is_not_bent(scene: Any) -> None:
+    """True jumps of speed, told by matches, stay: every second keyframe at half the time."""
+    found = []
+    for weight in (0.0, 25.0):
+        graph = chain(scene, 1.0, 1.0, weight)
+        for k, kf in enumerate(graph.keyframes):
+            time_s = k / 10 + (0.04 if k % 2 else 0.0)
+            graph.keyframes[k] = replace(kf, work=replace(kf.work, timestamp_s=time_s))
+        graph.solve_all(20, 1.0)
+        found.append(steps_of(graph))
+    np.testing.assert_allclose(found[1], found[0], rtol=0.005)
+
+
+def test_the_sparse_system_says_the_same(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    dense = chain(scene, 1.5, 0.0, 25.0)
+    dense.solve_all(4, 1.0)
+    monkeypatch.setattr(bundle_adjustment, "DENSE_MOST", 2)
+    sparse = chain(scene, 1.5, 0.0, 25.0)
+    sparse.solve_all(4, 1.0)
+    np.testing.assert_allclose(steps_of(sparse), steps_of(dense), rtol=1e-4)
+
+
+def test_only_keyframes_in_a_row_of_one_submap_and_one_video_speak(scene: Any) -> None:
+    graph = chain(scene, 1.0, 1.0, 25.0)
+    whole = in_a_row(graph, everything(graph)).ids.tolist()
+    assert whole == [[k, k + 1, k + 2] for k in range(VIEWS - 2)]
+    some = replace(everything(graph), ids=[0, 1, 2, 4, 5, 7])
+    assert in_a_row(graph, some).ids.tolist() == [[0, 1, 2]]
+    assert not sliding(graph)[0].steady and len(in_a_row(graph, replace(some, steady=False)).ids) == 0
+    graph.separate(range(8, VIEWS))
+    graph.held = 3  # keyframes of a saved map: of another video
+    rows = in_a_row(graph, everything(graph)).ids
+    assert rows[:, 0].tolist() == [3, 4, 5, 8, 9, 10, 11]
