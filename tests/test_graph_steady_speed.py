@@ -122,7 +122,7 @@ def test_a_part_that_no_match_measures_comes_out_at_the_speed_around_it(
 ) -> None:
     graph = chain(scene, 2.0, 0.0, weight)
     for _ in range(8):
-        graph.solve_all(20, 1.0)
+        graph.solve_all(20, 1.0, steady=True)
     np.testing.assert_allclose(steps_of(graph)[FIRST : END - 1], speed, rtol=0.1)
 
 
@@ -134,28 +134,29 @@ def test_what_matches_tell_is_not_bent(scene: Any) -> None:
         for k, kf in enumerate(graph.keyframes):
             time_s = k / 10 + (0.04 if k % 2 else 0.0)
             graph.keyframes[k] = replace(kf, work=replace(kf.work, timestamp_s=time_s))
-        graph.solve_all(20, 1.0)
+        graph.solve_all(20, 1.0, steady=True)
         found.append(steps_of(graph))
     np.testing.assert_allclose(found[1], found[0], rtol=0.005)
 
 
 def test_the_sparse_system_says_the_same(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     dense = chain(scene, 1.5, 0.0, 25.0)
-    dense.solve_all(4, 1.0)
+    dense.solve_all(4, 1.0, steady=True)
     monkeypatch.setattr(bundle_adjustment, "DENSE_MOST", 2)
     sparse = chain(scene, 1.5, 0.0, 25.0)
-    sparse.solve_all(4, 1.0)
+    sparse.solve_all(4, 1.0, steady=True)
     np.testing.assert_allclose(steps_of(sparse), steps_of(dense), rtol=1e-4)
 
 
 def test_only_keyframes_in_a_row_of_one_submap_and_one_video_speak(scene: Any) -> None:
     graph = chain(scene, 1.0, 1.0, 25.0)
-    whole = in_a_row(graph, everything(graph)).ids.tolist()
+    whole = in_a_row(graph, everything(graph, steady=True)).ids.tolist()
     assert whole == [[k, k + 1, k + 2] for k in range(VIEWS - 2)]
-    some = replace(everything(graph), ids=[0, 1, 2, 4, 5, 7])
+    some = replace(everything(graph, steady=True), ids=[0, 1, 2, 4, 5, 7])
     assert in_a_row(graph, some).ids.tolist() == [[0, 1, 2]]
-    assert not sliding(graph)[0].steady and len(in_a_row(graph, replace(some, steady=False)).ids) == 0
+    assert len(in_a_row(graph, replace(some, steady=False)).ids) == 0
+    assert not sliding(graph)[0].steady and not everything(graph).steady  # while tracking
     graph.separate(range(8, VIEWS))
     graph.held = 3  # keyframes of a saved map: of another video
-    rows = in_a_row(graph, everything(graph)).ids
+    rows = in_a_row(graph, everything(graph, steady=True)).ids
     assert rows[:, 0].tolist() == [3, 4, 5, 8, 9, 10, 11]

@@ -390,9 +390,9 @@ class KeyframeGraph:
         """True while the sliding window holds every keyframe of the submap being tracked."""
         return len(self.free_members()) <= self.config.window
 
-    def solve_all(self, iterations: int, kernel_px: float) -> SolveReport:
+    def solve_all(self, iterations: int, kernel_px: float, steady: bool = False) -> SolveReport:
         """Every keyframe moves but the first of each submap."""
-        report = self.optimise(everything(self), iterations, kernel_px, tolerance=1e-5)
+        report = self.optimise(everything(self, steady), iterations, kernel_px, tolerance=1e-5)
         self.normalise()
         self.last_report = report
         return report

@@ -181,7 +181,7 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     """
     members = graph.members()
     if len(members) <= LONG:
-        return [graph.solve_all(iterations, kernel_px) for kernel_px, iterations in WHOLE][-1].cost_last
+        return [graph.solve_all(iterations, kernel_px, True) for kernel_px, iterations in WHOLE][-1].cost_last
     first, last = members.index(ids[0]), members.index(ids[-1])
     around = members[max(first - AROUND, 0) : last + AROUND + 1]
     still = frozenset([around[0], *(k for k in around if k < graph.held)])

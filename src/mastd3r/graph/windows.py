@@ -62,10 +62,10 @@ def depths_of(graph: KeyframeGraph, kf_id: int) -> Window:
     return Window(near, edges, frozenset(near), ALL_INTRINSICS)
 
 
-def everything(graph: KeyframeGraph) -> Window:
+def everything(graph: KeyframeGraph, steady: bool = False) -> Window:
     """Every keyframe; the first of each submap stays, and a saved map."""
     still = frozenset([*graph.roots(), *range(graph.held)])
-    return Window(graph.variables.keys(), graph.edges, still, _held(graph, ()), steady=True)
+    return Window(graph.variables.keys(), graph.edges, still, _held(graph, ()), steady)
 
 
 def in_a_row(graph: KeyframeGraph, window: Window) -> SteadySpeed:

@@ -97,13 +97,13 @@ def turned_upright(graph: KeyframeGraph) -> tuple[str, dict[str, Any]]:
 
 
 def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
-    graph.solve_all(config.graph.final_iterations // 2, 1.0)
-    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    graph.solve_all(config.graph.final_iterations // 2, 1.0, steady=True)
+    report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px, steady=True)
     if radial_is_told(graph):
         return report
     log.info("lens: no radial term that the video tells from none, k = %.4f", graph.intrinsics.values[RADIAL[0]])
     graph.set_intrinsics(without_radial(graph.intrinsics))
-    return graph.solve_all(config.graph.final_iterations, config.graph.kernel_px)
+    return graph.solve_all(config.graph.final_iterations, config.graph.kernel_px, steady=True)
 
 
 def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:

@@ -100,7 +100,7 @@ def _close(graph: KeyframeGraph, found: list[_Seen]) -> None:
         _connect(graph, seen)
     if found:
         optimise_pose_graph(graph, [seen.loop for seen in found])
-        graph.solve_all(10, 2.0)
+        graph.solve_all(10, 2.0, steady=True)
 
 
 class _Chain:
