@@ -32,7 +32,7 @@ def steady(k: float) -> Array:
 def steady_graph(scene: Any, gap: int) -> KeyframeGraph:
     """Keyframes 0 … 9 of a steady camera, ``gap`` frames missing after the fifth; the rest is in a world of its own."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(steady_speed=0.0), intrinsics_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
     graph.intrinsics.values = scene.lens.copy()
     inv_depth = np.full(len(scene.px), 0.4)
     for k in range(VIEWS):

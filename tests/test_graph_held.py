@@ -25,7 +25,7 @@ Array = NDArray[Any]
 def held_graph(scene: Any, held: int, video_from_map: Array) -> KeyframeGraph:
     """Keyframes 0 … held of a map, the rest of a video that has a world of its own; edges within each."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(steady_speed=0.0), intrinsics_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
     graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
     ones = np.ones(len(scene.px))
     for k in range(len(scene.cam_from_world)):

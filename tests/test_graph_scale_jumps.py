@@ -26,22 +26,31 @@ def scene(exact_scene: Callable[..., Any]) -> Any:
     return exact_scene(VIEWS, step=0.08, cell_px=10)
 
 
+def neighbours_matched(
+    scene: Any, views: int, inside: range, across: float, depth_info: float, config: GraphConfig
+) -> KeyframeGraph:
+    """True keyframes matched with two on either side; matches between those ``inside`` and the others weigh ``across``.
+
+    ``depth_info``: of the depths' priors, times what they have."""
+    size = (scene.width, scene.height)
+    graph = KeyframeGraph(config, intrinsics_for(CameraConfig(), *size, size))
+    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
+    for k in range(views):
+        keyframe(graph, scene, k, k / 10, inverse(world_from(scene, k)), 1 / scene.depth(k))
+        graph.variables[k].prior_info = graph.variables[k].prior_info * depth_info
+    graph.started.add(0)
+    for i in range(views):
+        for j in range(max(i - 2, 0), min(i + 3, views)):
+            weight = across if (i in inside) != (j in inside) else 1.0
+            if i != j and weight:
+                graph.connect(i, j, scene.matches(i, j), np.full(len(scene.px), weight), followed=True)
+    return graph
+
+
 def chain(scene: Any, ratio: float, across: float = 1.0) -> KeyframeGraph:
     """Keyframes from ``JUMP_AT`` on are ``ratio`` times as large about the first of them as they are; matches between
     the two parts weigh ``across``."""
-    size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
-    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
-    for k in range(VIEWS):
-        keyframe(graph, scene, k, k / 10, inverse(world_from(scene, k)), 1 / scene.depth(k))
-        graph.variables[k].prior_info = graph.variables[k].prior_info * 1e-3
-    graph.started.add(0)
-    for i in range(VIEWS):
-        for j in range(max(i - 2, 0), min(i + 3, VIEWS)):
-            if i != j:
-                weight = across if (i < JUMP_AT) != (j < JUMP_AT) else 1.0
-                if weight:
-                    graph.connect(i, j, scene.matches(i, j), np.full(len(scene.px), weight), followed=True)
+    graph = neighbours_matched(scene, VIEWS, range(JUMP_AT, VIEWS), across, 1e-3, GraphConfig())
     centre = graph.world_from_cam(JUMP_AT)[:3, 3]
     graph.transform_keyframes(range(JUMP_AT, VIEWS), Sim3(np.eye(3), centre - ratio * centre, ratio))
     return graph

@@ -9,15 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mastd3r.config import CameraConfig, GraphConfig
-from mastd3r.geometry.se3 import inverse, se3_exp
+from mastd3r.config import Config, GraphConfig
+from mastd3r.geometry.se3 import se3_exp
 from mastd3r.geometry.sim3 import Sim3
 from mastd3r.graph import bundle_adjustment
-from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
+from mastd3r.graph.passages import SETTLING, cost_around, solved, thinned
 from mastd3r.graph.steady_speed import SteadySpeed
-from mastd3r.graph.windows import everything, in_a_row, sliding
-from test_submaps import keyframe, world_from
+from mastd3r.graph.windows import Window, everything, in_a_row, sliding
+from mastd3r.offline.final_solve import finish_graph
+from test_graph_scale_jumps import neighbours_matched
 
 VIEWS, FIRST, END = 14, 5, 10  # the keyframes between FIRST and END may be brought to a scale of their own
 ROWS, TIMES_S = [(0, 1, 2), (1, 2, 3)], {0: 0.0, 1: 0.3, 2: 0.5, 3: 0.9}
@@ -89,19 +90,7 @@ def scene(exact_scene: Callable[..., Any]) -> Any:
 def chain(scene: Any, ratio: float, across: float, weight: float) -> KeyframeGraph:
     """A camera at one speed; the keyframes from ``FIRST`` to ``END`` are ``ratio`` times as large, those after come
     along, and matches between them and the others weigh ``across``."""
-    size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(steady_speed=weight), intrinsics_for(CameraConfig(), *size, size))
-    graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
-    for k in range(VIEWS):
-        keyframe(graph, scene, k, k / 10, inverse(world_from(scene, k)), 1 / scene.depth(k))
-        graph.variables[k].prior_info = graph.variables[k].prior_info * 1e-6
-    graph.started.add(0)
-    for i in range(VIEWS):
-        for j in range(max(i - 2, 0), min(i + 3, VIEWS)):
-            apart = (FIRST <= i < END) != (FIRST <= j < END)
-            if i != j and (not apart or across):
-                static = np.full(len(scene.px), across if apart else 1.0)
-                graph.connect(i, j, scene.matches(i, j), static, followed=True)
+    graph = neighbours_matched(scene, VIEWS, range(FIRST, END), across, 1e-6, GraphConfig(steady_speed=weight))
     centre, end = graph.world_from_cam(FIRST)[:3, 3], graph.world_from_cam(END - 1)[:3, 3]
     graph.transform_keyframes(range(FIRST, END), Sim3(np.eye(3), centre - ratio * centre, ratio))
     moved = np.eye(4)
@@ -137,6 +126,27 @@ def test_what_matches_tell_is_not_bent(scene: Any) -> None:
         graph.solve_all(20, 1.0, steady=True)
         found.append(steps_of(graph))
     np.testing.assert_allclose(found[1], found[0], rtol=0.005)
+
+
+def test_whole_chains_after_the_last_frame_are_solved_with_it(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And of a passage what has settled from a start."""
+    graph, asked, optimise = chain(scene, 1.0, 1.0, 25.0), list[bool](), KeyframeGraph.optimise
+
+    def seen(graph: KeyframeGraph, problem: Window, *args: Any, **options: Any) -> Any:
+        asked.append(problem.steady)
+        return optimise(graph, problem, *args, **options)
+
+    monkeypatch.setattr(KeyframeGraph, "optimise", seen)
+    for solve, steady in (
+        (lambda: finish_graph(graph, Config()), {True}),
+        (lambda: cost_around(graph, [4, 5]), {True}),
+        (lambda: solved(thinned(graph, range(4, 10)), SETTLING[:-1]), {False}),
+        (lambda: solved(thinned(graph, range(4, 10)), SETTLING[-1:]), {True}),
+        (lambda: graph.solve_all(2, 1.0), {False}),
+    ):
+        asked.clear()
+        solve()
+        assert set(asked) == steady
 
 
 def test_the_sparse_system_says_the_same(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -197,6 +197,15 @@ def test_a_loop_is_seen_both_ways_and_closed(scene: Any) -> None:
     assert off(graph, centres) < 0.02
 
 
+@pytest.mark.parametrize(("many", "calls"), [(12, [False]), (13, [])])
+def test_what_many_look_like_is_forgotten(scene: Any, monkeypatch: pytest.MonkeyPatch, many: int, calls: Any) -> None:
+    graph, seen = drifted(scene)[0], list[bool]()  # once, before anything is solved
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.MANY", many)
+    front = Recognises(scene, graph, (2, 9))
+    front.forget = lambda: seen.append(graph.connected(2, 9))  # type: ignore[attr-defined]
+    assert len(close_loops(front, graph, front)) == 1 and seen == calls  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("share", "found"), [(0.3, True), (0.05, False)])
 def test_a_loop_is_found_by_what_two_views_share(scene: Any, share: float, found: bool) -> None:
     """Small pictures of the places do not look alike, but their features do."""

@@ -54,7 +54,7 @@ def keyframe(
 def cut_graph(scene: Any, scale: float = SCALE, b_from_a: Array = B_FROM_A) -> KeyframeGraph:
     """True keyframes 0 … 4 in one world, 5 … 9 in another one with lengths of its own; a frame hangs on 2 and on 7."""
     size = (scene.width, scene.height)
-    graph = KeyframeGraph(GraphConfig(steady_speed=0.0), intrinsics_for(CameraConfig(), *size, size))
+    graph = KeyframeGraph(GraphConfig(), intrinsics_for(CameraConfig(), *size, size))
     graph.intrinsics.values, graph.intrinsics.prior = scene.lens.copy(), scene.lens.copy()
     for k in range(VIEWS):
         if k == CUT:

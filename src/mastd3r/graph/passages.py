@@ -169,7 +169,7 @@ def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     cost, still = np.inf, frozenset([min(part.variables)])
     for kernel_px, iterations in steps:
         steady = kernel_px <= KERNEL_PX  # not of a start, where all may be at one place
-        window = Window(list(part.variables), part.edges, still, ALL_INTRINSICS, steady)
+        window = Window(list(part.variables), part.edges, still, ALL_INTRINSICS, steady=steady)
         cost = part.optimise(window, iterations, kernel_px).cost_last
     return cost
 
@@ -181,7 +181,7 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     """
     members = graph.members()
     if len(members) <= LONG:
-        return [graph.solve_all(iterations, kernel_px, True) for kernel_px, iterations in WHOLE][-1].cost_last
+        return [graph.solve_all(iterations, kernel_px, steady=True) for kernel_px, iterations in WHOLE][-1].cost_last
     first, last = members.index(ids[0]), members.index(ids[-1])
     around = members[max(first - AROUND, 0) : last + AROUND + 1]
     still = frozenset([around[0], *(k for k in around if k < graph.held)])
