@@ -27,6 +27,7 @@ from .graph.loose import leave_loose
 from .graph.merging import with_lost_frames
 from .graph.passages import retake_passages
 from .graph.scale_jumps import mend_scale_jumps
+from .graph.solved_anew import solve_anew
 from .metric.measure import measure
 from .offline.checkpoints import Checkpoints, Memory
 from .offline.extended_map import ExtendedMap
@@ -246,6 +247,7 @@ class Slam:
                 close_loops(self.two_view, graph, self.parts.places)
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
             retake_passages(graph, tried)  # more is matched now, which one explanation may fit and another not
+            solve_anew(graph)
             leave_loose(graph)
             mend_scale_jumps(graph)
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)

@@ -147,9 +147,9 @@ STARTS: tuple[Start, ...] = (_from_turn, _from_two_views)
 # -- a passage by itself -----------------------------------------------------------------------------------------
 
 
-def thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
+def thinned(graph: KeyframeGraph, ids: Sequence[int], points: int = MOST_POINTS) -> KeyframeGraph:
     """A graph of its own of some keyframes with some of their points; its lens is given."""
-    step = max(1, max(len(graph.variables[k].px) for k in ids) // MOST_POINTS)
+    step = max(1, max(len(graph.variables[k].px) for k in ids) // points)
     out = KeyframeGraph(graph.config, as_given(graph.intrinsics))
     out.size, out.submap = graph.size, graph.submap
     out.keyframes = [graph.keyframes[k] for k in ids]
@@ -221,7 +221,7 @@ def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> N
         from_first = pose @ inverse(first_new)
         from_first[:3, 3] /= ratio
         graph.set_keyframe_pose(k, from_first @ first_pose)
-        graph.set_depths(k, _at_all_points(graph.variables[k].px, inv_depth * ratio))
+        graph.set_depths(k, at_all_points(graph.variables[k].px, inv_depth * ratio))
     # lengths of what follows: as its end's were, which have become ``1 / grown`` of what they were
     new_end = Sim3.from_rigid(inverse(graph.variables[end].cam_from_world))
     world_from_old = new_end @ Sim3(np.eye(3), np.zeros(3), 1 / grown) @ old_end
@@ -229,7 +229,7 @@ def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> N
     graph.transform_keyframes(after, world_from_old)
 
 
-def _at_all_points(px: Array, thinned: Array) -> Array:
+def at_all_points(px: Array, thinned: Array) -> Array:
     """(p,) values at ``px`` (p, 2) from those of every n-th of them: the nearest one's."""
     step = -(-len(px) // len(thinned))
     return thinned[cKDTree(px[::step]).query(px)[1]]
