@@ -117,7 +117,7 @@ class GraphConfig:
     window_iterations: OneOrMore = 4
     final_iterations: OneOrMore = 40
     kernel_px: Positive = 0.5  # Cauchy scale of the final optimisation
-    steady_speed: NotNegative = 100.0  # px², of the prior that a camera's speed goes on, at its most; 0: none
+    steady_speed: NotNegative = 150.0  # weight of a speed that goes on, times the variance of matches; 0: none
     loop_overlap_ratio: Share = 0.5  # predicted share of points in view that makes an old keyframe a candidate
     min_match_ratio: Share = 0.04  # edges with a smaller matched share are dropped
     loops: bool = True  # places seen again, far apart in time, close the trajectory

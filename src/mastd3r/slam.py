@@ -24,6 +24,7 @@ from .geometry.se3 import inverse
 from .graph.intrinsics import intrinsics_for
 from .graph.keyframe_graph import KeyframeGraph
 from .graph.loose import leave_loose
+from .graph.match_noise import learn_match_variance
 from .graph.merging import with_lost_frames
 from .graph.passages import retake_passages
 from .graph.scale_jumps import mend_scale_jumps
@@ -238,6 +239,7 @@ class Slam:
         self._ended = True
         graph = self.graph
         self.keyframes.finish(self.state)
+        learn_match_variance(graph)
         for submap in sorted(graph.started):
             graph.submap = submap
             tried = set[tuple[int, int, int]]()

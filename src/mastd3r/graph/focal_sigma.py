@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.reprojection_kernels import edge_residuals
-from ..geometry.se3 import inverse
 from .intrinsics import PRIOR_FOCAL_SIGMA
 from .keyframe_graph import KeyframeGraph
+from .match_noise import squared_residuals
 
-Array = NDArray[Any]
 CORRELATION = 20.0  # errors of matches are alike within a view, so that they say less than as many independent ones
 SYSTEMATIC = 0.027  # 1 sigma of what no number of matches takes away, from sequences with truth
 ASSUMED = 0.5  # of the prior's sigma: where more is left, the data have hardly spoken
@@ -54,10 +51,7 @@ def residual_sigma_px(graph: KeyframeGraph, kernel_px: float) -> float:
     """
     squares = weights = 0.0
     for e in graph.edges:
-        v = graph.variables[e.i]
-        j_from_i = graph.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
-        residual, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, graph.intrinsics.values)
-        r2 = (residual**2).sum(1)
+        r2 = squared_residuals(graph, e)
         u = e.weight / (1 + r2 / kernel_px**2)
         squares, weights = squares + float((u**2 * r2).sum()), weights + float(u.sum())
     return float(np.sqrt(squares / max(2 * weights, 1e-12)))

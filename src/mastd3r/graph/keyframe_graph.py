@@ -67,6 +67,7 @@ class KeyframeGraph:
         self.held = 0  # keyframes of a saved map, the first: their poses stay, and their submap is 0
         self.found_at: int | None = None  # frame at which the video was found in that map
         self.last_report: SolveReport | None = None
+        self.match_variance_px2 = 1.0  # what a speed that goes on is weighed against
         self.loops: list[tuple[int, int, str]] = []  # two frames that may show one place, and what came of it
 
     # -- reading ---------------------------------------------------------------------------------------------

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from ..geometry.reprojection_kernels import edge_residuals
-from ..geometry.se3 import inverse
 from .factors import ReprojectionFactor
 from .keyframe_graph import KeyframeGraph
+from .match_noise import squared_residuals
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -90,10 +89,7 @@ def firm_weight(weights: dict[frozenset[int], float]) -> float:
 
 def _agreeing_weight(graph: KeyframeGraph, edge: ReprojectionFactor) -> float:
     """Weight of the matches of an edge that are where poses and depths put them."""
-    v = graph.variables[edge.i]
-    j_from_i = graph.variables[edge.j].cam_from_world @ inverse(v.cam_from_world)
-    off, _ = edge_residuals(v.px, v.inv_depth, edge.target.astype(float), j_from_i, graph.intrinsics.values)
-    return float(edge.weight[(off**2).sum(1) < AGREES_PX**2].sum())
+    return float(edge.weight[squared_residuals(graph, edge) < AGREES_PX**2].sum())
 
 
 def firm_parts(ids: Collection[int], weights: dict[frozenset[int], float], least: float = FIRM) -> list[frozenset[int]]:

@@ -151,7 +151,7 @@ def thinned(graph: KeyframeGraph, ids: Sequence[int], points: int = MOST_POINTS)
     """A graph of its own of some keyframes with some of their points; its lens is given."""
     step = max(1, max(len(graph.variables[k].px) for k in ids) // points)
     out = KeyframeGraph(graph.config, as_given(graph.intrinsics))
-    out.size, out.submap = graph.size, graph.submap
+    out.size, out.submap, out.match_variance_px2 = graph.size, graph.submap, graph.match_variance_px2
     out.keyframes = [graph.keyframes[k] for k in ids]
     out.submap_of = dict.fromkeys(ids, graph.submap)
     for k in ids:

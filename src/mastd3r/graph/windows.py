@@ -74,7 +74,7 @@ def in_a_row(graph: KeyframeGraph, window: Window) -> SteadySpeed:
     times_s = {kf.id: kf.work.timestamp_s for kf in graph.keyframes if kf.id in inside and kf.id >= graph.held}
     rows = [(k, k + 1, k + 2) for k in times_s if k + 1 in times_s and k + 2 in times_s]
     alike = [row for row in rows if len({graph.submap_of[k] for k in row}) == 1]
-    return SteadySpeed.of(alike, times_s, graph.config.steady_speed)
+    return SteadySpeed.of(alike, times_s, graph.config.steady_speed * graph.match_variance_px2)
 
 
 def _held(graph: KeyframeGraph, named: Iterable[int]) -> frozenset[int]:
