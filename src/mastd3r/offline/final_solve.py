@@ -30,6 +30,7 @@ from ..graph.turning import observed, put_at_infinity
 from ..types import State, Trajectory
 
 Array = NDArray[Any]
+COARSE = ((4.0, 0.15), (1.0, 0.5))  # kernel in pixels before the last, and its share of the iterations
 MOST_FIT_PX, CLEARLY = 0.3, 0.8  # kernel by which two minima are told apart, and the share of the cost that is less
 log = logging.getLogger(__name__)
 
@@ -97,7 +98,8 @@ def turned_upright(graph: KeyframeGraph) -> tuple[str, dict[str, Any]]:
 
 
 def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
-    graph.solve_all(config.graph.final_iterations // 2, 1.0, steady=True)
+    for kernel_px, share in COARSE:
+        graph.solve_all(max(int(share * config.graph.final_iterations), 1), kernel_px, steady=True)
     report = graph.solve_all(config.graph.final_iterations, config.graph.kernel_px, steady=True)
     if radial_is_told(graph):
         return report
