@@ -13,8 +13,10 @@ from mastd3r.graph import match_noise
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.match_noise import learn_match_variance, match_variance_px2, squared_residuals
 from mastd3r.graph.passages import thinned
+from mastd3r.graph.solved_anew import solve_anew
 from mastd3r.graph.windows import everything, in_a_row
 from test_graph_keyframes import graph_of
+from test_submaps import play, views_of
 
 VIEWS, NOISE_PX = 6, 0.4
 
@@ -74,3 +76,15 @@ def test_a_speed_that_goes_on_is_weighed_against_it(scene: Any) -> None:
     after = in_a_row(graph, everything(graph, steady=True)).weight
     np.testing.assert_allclose(after, before * match_variance_px2(graph))
     assert thinned(graph, range(VIEWS)).match_variance_px2 == graph.aside().match_variance_px2 < 1
+
+
+def test_after_the_last_frame_it_is_learned_and_the_chain_is_solved_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[int, float]] = []
+
+    def solved(graph: KeyframeGraph) -> bool:
+        seen.append((graph.submap, graph.match_variance_px2))
+        return solve_anew(graph)
+
+    monkeypatch.setattr("mastd3r.slam.solve_anew", solved)
+    graph = play(views_of(30)).slam.graph
+    assert seen == [(0, graph.match_variance_px2)] and 0 < graph.match_variance_px2 < 0.25

@@ -232,8 +232,9 @@ class Slam:
     def end_tracking(self) -> None:
         """After the last frame: submaps joined, passages explained anew, loops closed, what sees the same matched.
 
-        Jumps of scale are mended where that is cheaper, before others are matched by it, and again. What hangs by a
-        thread goes, and lost frames are looked for among the keyframes that stay.
+        Jumps of scale are mended where that is cheaper, before others are matched by it, and again. With all matches
+        there everything is solved anew once, coarse to fine. What hangs by a thread goes, and lost frames are looked
+        for among the keyframes that stay.
         """
         self._refuse_if_ended("finish")
         self._ended = True
