@@ -37,7 +37,7 @@ def endless(path: Path) -> list[str]:
         f"{e['loops_believed']}, {e['loops_false']}, {e['loops_refused']}",
         e["date"],
         e["machine"]["git_commit"],
-        e["machine"]["processor"],
+        e["machine"]["processor"] + (", beside other jobs" if e.get("beside_other_jobs") else ""),
     ]
     out.append("| " + " | ".join(map(str, cells)) + " |")
     return out
