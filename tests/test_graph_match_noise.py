@@ -53,6 +53,15 @@ def test_of_many_every_nth_is_looked_at(scene: Any, monkeypatch: pytest.MonkeyPa
     assert match_variance_px2(graph) == pytest.approx(every, rel=0.2)
 
 
+def test_before_there_are_poses_nothing_is_learned(scene: Any) -> None:
+    """And where poses are far off, not all of it is believed."""
+    graph = noisy(scene, 30.0)
+    assert match_variance_px2(graph) == match_noise.LARGEST_PX2
+    graph.started = set()
+    learn_match_variance(graph)
+    assert graph.match_variance_px2 == match_variance_px2(graph) == 1.0
+
+
 def test_without_matches_it_is_one(scene: Any) -> None:
     graph = noisy(scene)
     for n, e in enumerate(graph.edges):
@@ -88,3 +97,9 @@ def test_after_the_last_frame_it_is_learned_and_the_chain_is_solved_anew(monkeyp
     monkeypatch.setattr("mastd3r.slam.solve_anew", solved)
     graph = play(views_of(30)).slam.graph
     assert seen == [(0, graph.match_variance_px2)] and 0 < graph.match_variance_px2 < 0.25
+
+
+def test_a_clip_that_starts_at_its_end_learns_it_then() -> None:
+    """Three keyframes, one of them the last frame: poses come with the last solve, and so do residuals."""
+    graph = play(views_of(10)).slam.graph
+    assert graph.started and 0 < graph.match_variance_px2 < 1

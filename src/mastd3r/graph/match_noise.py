@@ -16,6 +16,7 @@ from .keyframe_graph import KeyframeGraph
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MOST = 1_000_000  # matches that are looked at
+LARGEST_PX2 = 4.0
 MEDIAN_OF_TWO = 2 * float(np.log(2))  # of r² where both coordinates are normal with variance 1
 
 
@@ -28,7 +29,12 @@ def squared_residuals(graph: KeyframeGraph, edge: ReprojectionFactor) -> Array:
 
 
 def learn_match_variance(graph: KeyframeGraph) -> None:
-    """Keep what ``match_variance_px2`` gives: from now on all solves weigh a speed that goes on against it."""
+    """Keep what ``match_variance_px2`` gives: from now on all solves weigh a speed that goes on against it.
+
+    Not before there are poses and depths: matches are then as far off as things have moved.
+    """
+    if not graph.started:
+        return
     graph.match_variance_px2 = match_variance_px2(graph)
     log.info("matches are off by %.2f px (1 sigma)", graph.match_variance_px2**0.5)
 
@@ -36,13 +42,15 @@ def learn_match_variance(graph: KeyframeGraph) -> None:
 def match_variance_px2(graph: KeyframeGraph) -> float:
     """Variance of a coordinate of the matches' residuals, from their weighted median; 1 where there are none.
 
-    Nearly half of them may be of things that move. Of many every n-th is looked at.
+    Only in submaps that have poses and depths. Nearly half of the matches may be of things that move; of many every
+    n-th is looked at. ``LARGEST_PX2`` at the most: beyond, what is off are the poses.
     """
-    step = 1 + sum(len(e.weight) for e in graph.edges) // MOST
-    squares = np.concatenate([np.zeros(0), *(squared_residuals(graph, e)[::step] for e in graph.edges)])
-    weights = np.concatenate([np.zeros(0), *(e.weight[::step] for e in graph.edges)])
+    edges = [e for e in graph.edges if graph.submap_of[e.i] in graph.started]
+    step = 1 + sum(len(e.weight) for e in edges) // MOST
+    squares = np.concatenate([np.zeros(0), *(squared_residuals(graph, e)[::step] for e in edges)])
+    weights = np.concatenate([np.zeros(0), *(e.weight[::step] for e in edges)])
     if not weights.sum() > 0:
         return 1.0
     order = np.argsort(squares)
     below = np.cumsum(weights[order])
-    return float(squares[order[np.searchsorted(below, below[-1] / 2)]]) / MEDIAN_OF_TWO
+    return min(float(squares[order[np.searchsorted(below, below[-1] / 2)]]) / MEDIAN_OF_TWO, LARGEST_PX2)

@@ -24,6 +24,7 @@ from ..graph.initialisation import bootstrap
 from ..graph.intrinsics import RADIAL, without_radial
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
 from ..graph.loose import AGREES_PX, FIRM_SHARE, agreeing_weights, firm_weight
+from ..graph.match_noise import learn_match_variance
 from ..graph.observability import Observability
 from ..graph.radial_terms import radial_is_told
 from ..graph.turning import observed, put_at_infinity
@@ -50,9 +51,12 @@ def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = T
     ``needs_motion``: depth comes from the camera's motion. InputError is raised for one that never moves; where it
     only turns, all points end at infinity and all keyframes at one place. Of several submaps one may do so.
     """
-    started = bool(graph.started) or (len(graph.members()) >= 2 and bootstrap(graph))
+    had_poses = bool(graph.started)
+    started = had_poses or (len(graph.members()) >= 2 and bootstrap(graph))
     if not needs_motion and not started:
         return None
+    if started and not had_poses:
+        learn_match_variance(graph)
     report = _solve(graph, config) if started else None
     seen, _ = observed(graph, graph.members())
     if needs_motion and len(graph.roots()) == 1 and not graph.held:  # in a saved map depth is known
