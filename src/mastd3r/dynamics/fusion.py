@@ -89,7 +89,7 @@ def accumulated(carried: Array, fresh: Array, like: Array | None, config: Dynami
 
     What was seen to move, and looks like what moves (``like``, by ``alike``), is not refuted by standing still, and
     not forgotten. Both must hold: a parked car of the same appearance was never seen to move, and is judged by its
-    own evidence. A ratio that is no number, as where a depth is lost in a scale gone wrong, says nothing.
+    own evidence. A ratio that is no number says nothing.
     """
     if not np.isfinite(fresh).all():
         fresh = np.where(np.isfinite(fresh), fresh, np.float32(0))
