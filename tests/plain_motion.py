@@ -31,6 +31,7 @@ def rigid_flow(
         dx, dy = dx * bend + x * pull, dy * bend + y * pull
         u, v = x * bend, y * bend
     target = cv2.merge([u * camera.fx_px + camera.cx_px, v * camera.fy_px + camera.cy_px])
+    target = np.nan_to_num(np.clip(target, -_UNKNOWN_PX, _UNKNOWN_PX), nan=_UNKNOWN_PX)
     slope = cv2.merge([dx * camera.fx_px, dy * camera.fy_px])
     return target, slope, cv2.merge([x, y]), inv_depth * scale * np.where(z > 1e-3, 1.0, -1.0)
 

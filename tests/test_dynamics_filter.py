@@ -249,3 +249,20 @@ def test_causal_masks_are_those_of_the_filter_and_never_see_what_follows() -> No
     begun = model.filter(W, H)
     CausalMasks(begun, learned)
     assert begun.appearance is learned  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("away", [5e3, 1e8])
+def test_a_pose_gone_far_astray_leaves_every_number_finite(away: float) -> None:
+    """A lens' law at what lies behind such a camera leaves float32; one NaN would stay in every later mask."""
+    lens = replace(CAMERA, k1=0.024, k2=-0.082, k3=0.055)
+    filter_, looks = LogOddsFilter(DynamicsConfig(), W, H), np.random.default_rng(0).normal(size=(60, 80, 11))
+    for i in range(8):
+        gray, pose, _ = frame(i, 3.0)
+        if i == 4:
+            pose = pose @ se3_exp(np.array([-0.7 * away, 0.0, -away, 0.0, 0.7, 0.0]))
+        given = input_of(i, gray, pose, camera=lens, features=looks.astype(np.float32))
+        filter_.prior(gray, features=given.features)
+        mask = filter_.update(given)
+        assert np.isfinite(mask.probability).all()
+        assert all(np.isfinite(term).all() for term in mask.evidence.values())
+    assert np.isfinite(filter_.appearance._weights).all()

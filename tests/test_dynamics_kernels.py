@@ -160,11 +160,3 @@ def test_region_mean() -> None:
     for given in (weight, None):
         plain = plain_motion.region_mean(guide, value, np.ones_like(value) if given is None else given, 20.0, 15.0)
         np.testing.assert_allclose(region_mean(layers, value, given, 20.0, 15.0), plain, atol=2e-5)
-
-
-def test_a_ratio_that_is_no_number_says_nothing() -> None:
-    """One such pixel would otherwise stay in every later mask, and in what is learned of the looks of things."""
-    carried, fresh = np.float32([[0.5, -1.0, 2.0]]), np.float32([[np.nan, np.inf, 0.3]])
-    found = accumulated(carried, fresh, None, DynamicsConfig())
-    expected = accumulated(carried, np.float32([[0.0, 0.0, 0.3]]), None, DynamicsConfig())
-    np.testing.assert_array_equal(found, expected)

@@ -89,10 +89,8 @@ def accumulated(carried: Array, fresh: Array, like: Array | None, config: Dynami
 
     What was seen to move, and looks like what moves (``like``, by ``alike``), is not refuted by standing still, and
     not forgotten. Both must hold: a parked car of the same appearance was never seen to move, and is judged by its
-    own evidence. A ratio that is no number says nothing.
+    own evidence.
     """
-    if not np.isfinite(fresh).all():
-        fresh = np.where(np.isfinite(fresh), fresh, np.float32(0))
     out = np.empty(carried.shape, np.float32)
     limits = _F(config.evidence_gain), _F(config.max_log_odds)
     _accumulated(

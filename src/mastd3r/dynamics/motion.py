@@ -35,7 +35,10 @@ class RigidFlow:
 
 
 def rigid_flow(camera: Camera, rays: Array, past_from_cur: Array, inv_depth: Array) -> RigidFlow:
-    """A static scene's flow current -> past. ``rays`` (3, h, w) float32 with z = 1, ``inv_depth`` (h, w) >= 0."""
+    """A static scene's flow current -> past, its targets finite however far off the pose is.
+
+    ``rays`` (3, h, w) float32 with z = 1, ``inv_depth`` (h, w) >= 0.
+    """
     h, w = inv_depth.shape
     target, slope, xy = (np.empty((h, w, 2), _F) for _ in range(3))
     near, inside = np.empty((h, w), _F), np.empty((h, w), _F)
@@ -63,7 +66,7 @@ def _rigid(
             r2 = x * x + y * y
             bend = one + r2 * (k1 + r2 * (k2 + k3 * r2))
             pull = _F(2) * (k1 + r2 * (_F(2) * k2 + _F(3) * k3 * r2)) * (x * dx + y * dy)
-            u, v = x * bend * fx + cx, y * bend * fy + cy
+            u, v = bounded(x * bend * fx + cx), bounded(y * bend * fy + cy)  # far outside a lens' law leaves float32
             target[j, i, 0], target[j, i, 1] = u, v
             slope[j, i, 0], slope[j, i, 1] = (dx * bend + x * pull) * fx, (dy * bend + y * pull) * fy
             xy[j, i, 0], xy[j, i, 1] = x, y
@@ -101,6 +104,8 @@ def _twist_system(
 ) -> tuple[Array, Array]:
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for n in range(len(residual)):
+        if weight[n] == 0:
+            continue
         a, b = jacobian[n, 0], jacobian[n, 1]
         rx, ry = residual[n, 0], residual[n, 1]
         for k in range(6):
