@@ -69,6 +69,16 @@ def test_velocity_is_not_believed_for_long(scene: Any) -> None:
     assert ahead == pytest.approx(3 * np.linalg.norm(se3_log(inverse(steady(0)) @ steady(4))), rel=1e-6)
 
 
+def test_broken_depths_at_the_edge_of_a_gap_have_no_say(scene: Any) -> None:
+    """Where somebody fills the picture on both sides of a loss, the keyframes there have depths of any size."""
+    graph = steady_graph(scene, 0)
+    for k, times in ((CUT - 1, 8.0), (CUT, 0.02), (CUT + 1, 0.05)):
+        graph.set_depths(k, graph.variables[k].inv_depth * times)
+    bridge_submaps(graph)
+    for k in range(VIEWS):
+        np.testing.assert_allclose(graph.world_from_cam(k), steady(k), atol=1e-6)
+
+
 def test_three_submaps_are_bridged_one_after_another(scene: Any) -> None:
     graph = steady_graph(scene, 2)
     graph.start_submap()
