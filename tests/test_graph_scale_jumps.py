@@ -12,6 +12,7 @@ import pytest
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.se3 import inverse, transform
 from mastd3r.geometry.sim3 import Sim3
+from mastd3r.graph import passages
 from mastd3r.graph import scale_jumps as scale_jumps_module
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
@@ -99,7 +100,7 @@ def test_what_lies_between_two_jumps_is_mended_by_itself(scene: Any, monkeypatch
 
 def test_only_what_lies_before_the_end_is_brought_to_another_scale(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     graph, costs = chain(scene, 1.0), iter([2.0, 1.0])
-    monkeypatch.setattr(scale_jumps_module, "cost_around", lambda *_: next(costs))
+    monkeypatch.setattr(passages, "cost_around", lambda *_: next(costs))
     depths = {k: v.inv_depth.copy() for k, v in graph.variables.items()}
     assert scale_jumps_module._rescaled(graph, 5, 0.5, 9)
     for k, v in graph.variables.items():
@@ -129,7 +130,7 @@ def test_a_jump_that_matches_tell_of_stays(scene: Any) -> None:
 
 def test_what_costs_more_is_left_with_all_that_belongs_to_it(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     graph, costs = chain(scene, 0.2, across=0.0), iter([1000.0, 1000.0 + 1.1 * UNTOLD])
-    monkeypatch.setattr(scale_jumps_module, "cost_around", lambda *_: next(costs))
+    monkeypatch.setattr(passages, "cost_around", lambda *_: next(costs))
     kept = {k: (v.cam_from_world.copy(), v.inv_depth.copy(), v.prior_depth.copy()) for k, v in graph.variables.items()}
     assert mend_scale_jumps(graph) == 0
     for k, (pose, inv_depth, prior) in kept.items():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mastd3r.geometry.se3 import inverse, se3_exp, transform
+from mastd3r.graph import passages
 from mastd3r.graph import solved_anew as module
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.passages import state_of
@@ -56,7 +57,7 @@ def test_what_costs_more_on_all_points_is_put_back(
     graph, _ = wrong
     before, costs = state_of(graph), iter([1.0, 1.0])
     lens = graph.intrinsics.values.copy()
-    monkeypatch.setattr(module, "cost_around", lambda *_: next(costs))
+    monkeypatch.setattr(passages, "cost_around", lambda *_: next(costs))
     assert not solve_anew(graph)
     assert next(costs, None) is None
     np.testing.assert_array_equal(graph.intrinsics.values, lens)
@@ -70,7 +71,7 @@ def test_where_a_few_points_know_nothing_better_all_are_left_alone(
 ) -> None:
     graph = true_chain(exact_scene)
     before = state_of(graph)
-    monkeypatch.setattr(module, "cost_around", lambda *_: pytest.fail("everything was solved"))
+    monkeypatch.setattr(passages, "cost_around", lambda *_: pytest.fail("everything was solved"))
     assert not solve_anew(graph)
     for k, (pose, _) in before.items():
         np.testing.assert_array_equal(graph.variables[k].cam_from_world, pose)

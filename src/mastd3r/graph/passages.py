@@ -110,15 +110,12 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
     if best is None:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
-    before, kept, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
-    replace_passage(graph, ids, best[1])
-    after = cost_around(graph, ids)
-    if after < before:
-        log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, best[0],
-                 before, after)  # fmt: skip
-        return True
-    put_back(graph, kept, lens)
-    return False
+    found, state = best
+    taken, before, after = kept_if_cheaper(graph, ids, lambda: replace_passage(graph, ids, state))
+    if taken:
+        log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, found, before,
+                 after)  # fmt: skip
+    return taken
 
 
 # -- starts ------------------------------------------------------------------------------------------------------
@@ -191,6 +188,28 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end
     graph.transform_keyframes(members[last + AROUND + 1 :], Sim3.from_rigid(moved))
     return cost
+
+
+def kept_if_cheaper(
+    graph: KeyframeGraph,
+    ids: Sequence[int],
+    change: Callable[[], None],
+    undo: Callable[[], None] | None = None,
+    dearer: float = 0.0,
+) -> tuple[bool, float, float]:
+    """Change the graph, and change it back unless the whole costs less around ``ids``: (kept, cost before, and after).
+
+    ``undo``: takes back what ``change`` did beside poses and depths. ``dearer``: by how much it may cost more.
+    """
+    before, state, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
+    change()
+    after = cost_around(graph, ids)
+    kept = after < before + dearer
+    if not kept:
+        if undo is not None:
+            undo()
+        put_back(graph, state, lens)
+    return kept, before, after
 
 
 def state_of(graph: KeyframeGraph) -> State:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from .keyframe_graph import KeyframeGraph
-from .passages import cost_around, put_back, state_of
+from .passages import kept_if_cheaper
 
 Array = NDArray[Any]
 log = logging.getLogger(__name__)
@@ -91,16 +91,16 @@ def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = 
     """
     after = [k for k in graph.free_members() if k >= kf_id and (end is None or k < end)]
     around = [max((k for k in graph.free_members() if k < kf_id), default=kf_id), kf_id]
-    before, kept, lens = cost_around(graph, around), state_of(graph), graph.intrinsics
-    centre = inverse(graph.variables[kf_id].cam_from_world)[:3, 3]
-    there = Sim3(np.eye(3), centre - centre / ratio, 1 / ratio)
-    graph.transform_keyframes(after, there)
-    now = cost_around(graph, around)
-    taken = now < before + UNTOLD
+
+    def change() -> None:
+        centre = inverse(graph.variables[kf_id].cam_from_world)[:3, 3]
+        graph.transform_keyframes(after, Sim3(np.eye(3), centre - centre / ratio, 1 / ratio))
+
+    def undo() -> None:  # of the priors of depths, and of the frames that hang on them
+        graph.transform_keyframes(after, Sim3(np.eye(3), np.zeros(3), ratio))
+
+    taken, before, now = kept_if_cheaper(graph, around, change, undo, UNTOLD)
     frames = [graph.keyframes[k].work.index for k in (kf_id, after[-1])]
     log.info("frames %d to %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
              *frames, ratio, before, now, "taken" if taken else "left")  # fmt: skip
-    if not taken:
-        graph.transform_keyframes(after, there.inverse())  # the priors of depths, and the frames that hang on them
-        put_back(graph, kept, lens)
     return taken

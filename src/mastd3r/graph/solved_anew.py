@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from .keyframe_graph import KeyframeGraph
-from .passages import LONG, at_all_points, cost_around, put_back, solved, state_of, thinned
+from .passages import LONG, at_all_points, kept_if_cheaper, solved, state_of, thinned
 
 log = logging.getLogger(__name__)
 POINTS = 150  # of a keyframe
@@ -38,16 +38,16 @@ def solve_anew(graph: KeyframeGraph) -> bool:
     there_cost = solved(part, SETTLING)
     if there_cost > BETTER * here_cost:
         return False
-    before, kept, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
-    for k, (pose, inv_depth) in state_of(part).items():
-        graph.set_keyframe_pose(k, pose)
-        graph.set_depths(k, at_all_points(graph.variables[k].px, inv_depth))
-    now = cost_around(graph, ids)
+
+    def take() -> None:
+        for k, (pose, inv_depth) in state_of(part).items():
+            graph.set_keyframe_pose(k, pose)
+            graph.set_depths(k, at_all_points(graph.variables[k].px, inv_depth))
+
+    taken, before, now = kept_if_cheaper(graph, ids, take)
     log.info("%d keyframes solved anew, coarse to fine: cost %.0f -> %.0f on a few points, %.0f -> %.0f on all, %s",
-             len(ids), here_cost, there_cost, before, now, "taken" if now < before else "left")  # fmt: skip
-    if now >= before:
-        put_back(graph, kept, lens)
-    return now < before
+             len(ids), here_cost, there_cost, before, now, "taken" if taken else "left")  # fmt: skip
+    return taken
 
 
 def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
