@@ -114,6 +114,14 @@ def test_a_wrong_pose_is_taken_out_though_a_third_of_the_pixels_move() -> None:
     assert left.max() < 0.3
 
 
+def test_a_pixel_without_weight_has_no_say_whatever_its_derivative() -> None:
+    rng = np.random.default_rng(2)
+    jacobian, residual, weight = rng.normal(size=(80, 2, 6)), rng.normal(size=(80, 2)), np.ones(80)
+    jacobian[0], weight[0] = np.inf, 0
+    found = residual_twist(jacobian, residual, weight, 0.5, np.ones(6))
+    np.testing.assert_array_equal(found, residual_twist(jacobian[1:], residual[1:], weight[1:], 0.5, np.ones(6)))
+
+
 def test_pose_jacobian_is_the_derivative_of_the_projection() -> None:
     camera = Camera.centred(200.0, 256, 192)
     point = np.array([0.3, -0.2, 1.6])
