@@ -104,7 +104,7 @@ def test_a_hint_decides_where_the_views_cannot(exact_scene: Callable[..., Any]) 
     scene = exact_scene(3, step=0.1, focal_px=330.0)
     graph = graph_of(scene, 3, noise_px=0.3)
     graph.set_intrinsics(intrinsics_for(CameraConfig(), 320, 240, (320, 240), 330.0))
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
     assert np.exp(graph.intrinsics.values[0]) == pytest.approx(330.0, rel=0.02)
 
 

@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 from mastd3r.camera.pinhole import Camera
 from mastd3r.config import CameraConfig, GraphConfig
 from mastd3r.geometry.reprojection_kernels import AnchorMatches, anchor_cost
-from mastd3r.geometry.se3 import inverse, se3_exp, se3_log
-from mastd3r.geometry.sim3 import procrustes
+from mastd3r.geometry.se3 import inverse, se3_exp
 from mastd3r.graph.covisibility import covisible, nearest_keyframe, overlap
 from mastd3r.graph.depth import carried, depth_confidence, inpainted, upsampled
-from mastd3r.graph.initialisation import bootstrap
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.place_recognition import PlaceRecognition, build_thumbnail
@@ -61,63 +59,6 @@ def costs(graph: KeyframeGraph) -> Array:
         matches = AnchorMatches.of([e.target], [e.weight])
         out.append(anchor_cost(a.px, a.inv_depth, matches, j_from_i, graph.intrinsics.values, 1.0)[0])
     return np.array(out)
-
-
-@pytest.mark.parametrize(("focal_px", "k"), [(220.0, 0.0), (260.0, -0.05), (330.0, 0.0)])
-def test_bootstrap_from_nothing(exact_scene: Callable[..., Any], focal_px: float, k: float) -> None:
-    """Five keyframes, 0.2 px of noise, nothing known of lens or depth: near enough to go on from."""
-    scene = exact_scene(5, step=0.2, focal_px=focal_px, k=k, cell_px=8)
-    graph = graph_of(scene, 5, noise_px=0.2)
-    assert bootstrap(graph) and graph.initialised
-    report = graph.solve_all(40, 0.5)
-    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(focal_px, rel=0.05)
-    found = np.stack([graph.world_from_cam(i) for i in range(5)])
-    truth = np.stack([scene.cam_from_world[0] @ inverse(scene.cam_from_world[i]) for i in range(5)])
-    np.testing.assert_allclose(found[0], np.eye(4), atol=1e-12)  # the gauge: the world is the first camera
-    fit = procrustes(truth[:, :3, 3], found[:, :3, 3], np.ones(5), with_scale=True)
-    path = np.linalg.norm(np.diff(truth[:, :3, 3], axis=0), axis=1).sum()
-    off = np.linalg.norm(fit.apply(found[:, :3, 3]) - truth[:, :3, 3], axis=1)
-    assert off.max() < 0.05 * path and report.cost_last <= report.cost_first
-    turns = [np.linalg.norm(se3_log(inverse(t) @ f)[3:]) for t, f in zip(truth, found, strict=True)]
-    assert max(turns) < 0.03
-    assert np.median([graph.median_inv_depth(i) for i in range(3)]) == pytest.approx(1.0)
-    for i in range(5):
-        seen = graph.variables[i].depth_info > 1
-        ratio = fit.scale / graph.variables[i].inv_depth[seen] / scene.depth(i)[seen]
-        assert np.median(np.abs(ratio - 1)) < 0.06
-
-
-def test_bootstrap_leaves_out_what_moves_by_itself(exact_scene: Callable[..., Any]) -> None:
-    """A fifth of the picture drifts across it, each of its matches in step with the others; nothing says so."""
-    scene = exact_scene(5, step=0.15, focal_px=280.0, cell_px=8)
-    graph = graph_of(scene, 5, noise_px=0.2)
-    moves = (np.abs(scene.px - [120, 120]) < [42, 62]).all(1)
-    assert 0.1 < moves.mean() < 0.2
-    for e in graph.edges:
-        e.target = e.target + moves[:, None] * (e.j - e.i) * np.array([2.0, 8.0])
-    assert bootstrap(graph)
-    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(280, rel=0.05)
-    held = sum(e.weight[moves].sum() for e in graph.edges) / sum(e.weight.sum() for e in graph.edges)
-    assert held < 0.02
-    for kf in graph.keyframes:
-        assert np.mean(kf.static[moves] < 0.5) > 0.9 and np.mean(kf.static[~moves] > 0.5) > 0.97
-        assert kf.moving[120, 120] > 127 and kf.moving[20, 290] == 0
-
-
-def test_bootstrap_with_a_given_lens_keeps_it(exact_scene: Callable[..., Any]) -> None:
-    scene = exact_scene(5, step=0.2, focal_px=260.0)
-    given = CameraConfig(intrinsics=(260.0, 260.0, 159.5, 119.5))
-    graph = graph_of(scene, 5, noise_px=0.1, camera=given)
-    assert bootstrap(graph)
-    assert np.exp(graph.intrinsics.values[0]) == pytest.approx(260.0) and graph.intrinsics.values[1] == 0.0
-    assert (graph.solve_all(5, 1.0).focal_sigma_ratio) == np.inf
-
-
-def test_bootstrap_says_no_without_matches(exact_scene: Callable[..., Any]) -> None:
-    scene = exact_scene(3, step=0.2)
-    graph = graph_of(scene, 3)
-    graph.edges = []
-    assert not bootstrap(graph) and not graph.initialised
 
 
 def test_a_window_moves_only_what_it_may(exact_scene: Callable[..., Any]) -> None:

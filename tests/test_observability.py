@@ -117,7 +117,7 @@ def test_traffic_before_a_tripod_is_no_parallax(scene: Any, noise_px: float, hal
     still = standing(scene)
     graph = graph_of(still, noise_px, moves=(box(still, (150, 120), half), np.array([9.0, 3.0])))
     assert kind_of(graph) == "none"
-    assert not bootstrap(graph) and not graph.started
+    assert not bootstrap(graph).started and not graph.started
     with pytest.raises(
         InputError, match=r"^the camera never moves: expected .*, got \d\d% of the matches, .* 5 frames"
     ):
@@ -134,7 +134,7 @@ def test_a_camera_that_only_turns(
     scene = turning(exact_scene(VIEWS, focal_px=focal_px, cell_px=10))
     car = box(scene, (160, 150), (50, 40)), np.array([4.0, -9.0])
     graph = graph_of(scene, noise_px, moves=car if with_car else None)
-    assert kind_of(graph) == "rotation" and not bootstrap(graph)
+    assert kind_of(graph) == "rotation" and not bootstrap(graph).started
     seen = finish_graph(graph, Config())
     assert seen is not None and seen.kind == "rotation" and graph.started == {0}
     for k in range(VIEWS):
@@ -152,7 +152,7 @@ def test_real_parallax_is_accepted(scene: Any, noise_px: float) -> None:
     graph = graph_of(scene, noise_px)
     seen, _ = observed(graph, graph.members())
     assert seen.kind == "parallax" and seen.supports > 0.5 * seen.cells and seen.turn_ratio < 0.5
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
     assert (found := finish_graph(graph, Config())) is not None and found.kind == "parallax"
 
 
@@ -161,7 +161,7 @@ def test_real_parallax_is_accepted(scene: Any, noise_px: float) -> None:
 def test_a_plane_that_a_camera_passes_is_not_refused(scene: Any, noise_px: float, slopes: tuple[float, float]) -> None:
     graph = graph_of(scene, noise_px, plane=slopes)
     assert kind_of(graph) == "plane"
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
 
 
 def test_a_shift_along_a_wall_is_no_turn(scene: Any) -> None:
@@ -191,7 +191,7 @@ def test_a_turn_followed_by_a_walk_starts_with_the_walk(scene: Any) -> None:
     turns = {(p.ref, p.new) for p in pairs if explained_by_turn(p, seen.noise_px, graph.size)}
     assert {(i, j) for i, j in turns if i < j} == {(0, 1), (0, 2), (1, 2)}
     assert not turns & {(e.i, e.j) for e in first_pairs(graph, turns)}
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
     seen = finish_graph(graph, Config())
     assert seen is not None and seen.kind == "parallax"
     assert np.linalg.norm(graph.world_from_cam(5)[:3, 3]) > 5 * np.linalg.norm(graph.world_from_cam(2)[:3, 3])
@@ -200,7 +200,7 @@ def test_a_turn_followed_by_a_walk_starts_with_the_walk(scene: Any) -> None:
 def test_a_part_that_only_turns_changes_nothing_for_the_rest(scene: Any) -> None:
     """The second of two submaps turns: it is solved as ever."""
     graph = graph_of(scene, LOW_PX)
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
     graph.start_submap()
     second = graph_of(turning(scene), LOW_PX)
     for kf in second.keyframes:
@@ -318,7 +318,7 @@ def test_noise_makes_the_focal_length_less_sure(scene: Any) -> None:
 
 def test_a_given_focal_length_has_no_sigma(scene: Any) -> None:
     graph = graph_of(scene, LOW_PX, camera=CameraConfig(intrinsics=(280.0, 280.0, 159.5, 119.5)))
-    assert bootstrap(graph)
+    assert bootstrap(graph).started
     graph.solve_all(5, 0.5)
     assert focal_knowledge(graph) is None
 

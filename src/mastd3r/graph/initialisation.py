@@ -44,8 +44,16 @@ class _Start:
     state: dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of each keyframe
 
 
-def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
-    """Solve all keyframes of the submap being tracked. False where no start was found (too little parallax).
+@dataclass(frozen=True)
+class StartReport:
+    """What came of trying to start the submap being tracked."""
+
+    started: bool
+    agreeing: float | None = None  # share of the matches that the best start explains; None where none was tried
+
+
+def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> StartReport:
+    """Solve all keyframes of the submap being tracked, where one camera and one static scene explain their matches.
 
     As long as there is no map at all, keyframes between which the camera stands still, or only turns, are not tried:
     a start would be found, and mean nothing (graph/observability.py).
@@ -63,11 +71,11 @@ def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
         seen, pairs = observed(graph, graph.members()[-LOOKED_AT:])
         if seen.kind in ("none", "rotation"):
             log.info("no start: the image motion is that of a camera %s", WITHOUT_PARALLAX[seen.kind])
-            return False
+            return StartReport(False)
         turns = {(p.ref, p.new) for p in pairs if explained_by_turn(p, seen.noise_px, graph.size)}
     best = min(_starts(graph, turns, hurry), key=lambda start: start.cost, default=None)
     if best is None:
-        return False
+        return StartReport(False, 0.0)
     graph.set_intrinsics(best.intrinsics)
     whole.set_intrinsics(replace(whole.intrinsics, values=best.intrinsics.values))  # the best guess, if it fails too
     world_from_first = inverse(best.state[min(best.state)][0])
@@ -77,7 +85,7 @@ def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
     agreeing = _agreement(graph)
     if agreeing < MIN_AGREEMENT:
         log.info("no start: only %.0f %% of the matches fit one camera and one static scene", 100 * agreeing)
-        return False
+        return StartReport(False, agreeing)
     for k, static in _without_what_is_left(graph).items():
         whole.discount_points(k, static)
     for k in graph.variables:  # the last start that was tried has left its own there
@@ -91,7 +99,7 @@ def bootstrap(whole: KeyframeGraph, *, hurry: bool = False) -> bool:
         len(graph.keyframes),
         _focal_px(graph),
     )
-    return True
+    return StartReport(True, agreeing)
 
 
 def _starts(graph: KeyframeGraph, turns: set[tuple[int, int]], hurry: bool) -> Iterator[_Start]:

@@ -20,7 +20,7 @@ from ..geometry.sim3 import Sim3
 from ..geometry.upright import TOLD_RAD, down, turn_upright
 from ..graph.bridging import bridge_submaps
 from ..graph.bundle_adjustment import SolveReport
-from ..graph.initialisation import bootstrap
+from ..graph.initialisation import MIN_AGREEMENT, bootstrap
 from ..graph.intrinsics import RADIAL, without_radial
 from ..graph.keyframe_graph import FrameRecord, KeyframeGraph
 from ..graph.loose import AGREES_PX, FIRM_SHARE, agreeing_weights, firm_weight
@@ -52,7 +52,8 @@ def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = T
     only turns, all points end at infinity and all keyframes at one place. Of several submaps one may do so.
     """
     had_poses = bool(graph.started)
-    started = had_poses or (len(graph.members()) >= 2 and bootstrap(graph))
+    start = bootstrap(graph) if not had_poses and len(graph.members()) >= 2 else None
+    started = had_poses or (start is not None and start.started)
     if not needs_motion and not started:
         return None
     if started and not had_poses:
@@ -69,6 +70,12 @@ def finish_graph(graph: KeyframeGraph, config: Config, *, needs_motion: bool = T
         if seen.kind == "rotation":
             put_at_infinity(graph)
             report = _solve(graph, config)
+    if report is None and start is not None and start.agreeing is not None:
+        raise InputError(
+            f"no structure can be found: expected at least {MIN_AGREEMENT:.0%} of the matches between keyframes to fit "
+            f"one camera and one static scene, got {start.agreeing:.0%} between {len(graph.keyframes)} keyframes in "
+            f"{len(graph.records)} frames"
+        )
     if report is None:
         raise InputError(
             f"the camera never moves enough: expected image motion of at least "

@@ -29,6 +29,7 @@ from ..export.read_run import read_run
 from ..export.run_folder import RunFolder
 from ..graph.focal_sigma import focal_facts
 from ..graph.initialisation import bootstrap
+from ..graph.starting import drop_let_go
 from ..parts import used_accelerator
 from ..progress import Reporter
 from ..tracking.depth_prior import own_depth_spread
@@ -378,7 +379,8 @@ class RunJob:
         try:
             graph = self.graph
             graph.leave_map_unless_found()
-            started = self._final or graph.started or (len(graph.members()) > 1 and bootstrap(graph))
+            drop_let_go(graph)
+            started = self._final or graph.started or (len(graph.members()) > 1 and bootstrap(graph).started)
             if not self._final and started:  # before that there is neither place nor lens
                 if graph.initialised:
                     graph.solve_all(5, 1.0)

@@ -16,6 +16,7 @@ from ..graph.covisibility import nearest_keyframe
 from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
 from ..graph.prediction import rigid_flow_to
+from ..graph.starting import drop_let_go, start_or_let_go
 from ..parts import Parts
 from ..pointmap.flow_maps import invert_flow
 from ..types import WorkFrame
@@ -180,7 +181,7 @@ class Keyframes:
         """A keyframe before there is depth: its matches, and the start once there are enough of them."""
         graph = self.graph
         self.edges.add_recent(graph, kf, before)
-        if len(graph.members()) >= self.config.graph.bootstrap_keyframes and bootstrap(graph):
+        if start_or_let_go(graph):
             self.edges.flows.clear()
 
     def _connect(self, kf: Keyframe, before: int) -> None:
@@ -236,8 +237,9 @@ class Keyframes:
             enough = LAST_MOTION * (t.keyframe_motion_ratio if graph.initialised else t.first_motion_ratio)
             if self.two_view.accepted(view) and view.motion_ratio > enough:
                 self._add(state, view)
+        drop_let_go(graph)
         elsewhere = graph.started - ({MAP} if self.entry.wanted else set())
-        if elsewhere and graph.keyframes and not graph.initialised and not bootstrap(graph):
+        if elsewhere and graph.keyframes and not graph.initialised and not bootstrap(graph).started:
             graph.drop_submap()
             graph.submap = graph.submap_of[graph.latest.id]
         self._join_all()

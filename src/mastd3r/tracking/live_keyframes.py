@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..alignment.reproject import StaticMatches, solve_pose
 from ..concurrency import Future
 from ..config import Config
-from ..graph.initialisation import bootstrap
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
+from ..graph.starting import start_or_let_go
 from ..parts import Parts
 from ..pointmap.flow_maps import invert_flow
 from .depth_prior import predicted_depth
@@ -124,8 +124,7 @@ class LiveKeyframes(Keyframes):
     def _started(self, aside: KeyframeGraph, back: Back, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
         self._matched_back(aside, back)
         self._matched(aside, new)
-        if len(aside.members()) >= self.config.graph.bootstrap_keyframes:
-            bootstrap(aside, hurry=True)
+        start_or_let_go(aside, hurry=True)
         return aside
 
     def _joined(self, aside: KeyframeGraph, back: Back, new: list[tuple[Keyframe, int]]) -> KeyframeGraph:
@@ -160,6 +159,7 @@ class LiveKeyframes(Keyframes):
         """A copy that a job may do with as it likes; the unit of length stays, for frames hang on this one."""
         aside = self.graph.aside()
         aside.edges, aside.started = [copy.copy(e) for e in aside.edges], set(aside.started)
+        aside.submap_of = dict(aside.submap_of)
         aside.normalise = lambda: None  # type: ignore[method-assign]
         return aside
 
@@ -183,6 +183,7 @@ class LiveKeyframes(Keyframes):
         graph.edges = made.edges + graph.edges[self._edges_before :]
         graph.variables.update((kf.id, made.variables[kf.id]) for kf in known)
         graph.set_intrinsics(made.intrinsics)
+        graph.submap_of.update((kf.id, made.submap_of[kf.id]) for kf in known)
         if not made.initialised:
             self._waiting = new
             return 1.0
