@@ -212,8 +212,11 @@ def first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[Repro
 def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
     """Two views by the essential matrix, the others one by one, then all; the robust cost, None on failure."""
     _reset(graph)
-    if not _two_view(graph, pair):
+    pose = two_view_pose(graph, pair)
+    if pose is None:
         return None
+    pose[:3, 3] *= 0.1
+    graph.set_keyframe_pose(pair.j, pose)
     done = [pair.i, pair.j]
     _solve_part(graph, done, frozenset([pair.i]), 15, 2.0)
     while len(done) < len(graph.keyframes):
@@ -248,22 +251,22 @@ def _reset(graph: KeyframeGraph) -> None:
         graph.forget_matched_depths(k)
 
 
-def _two_view(graph: KeyframeGraph, edge: ReprojectionFactor) -> bool:
+def two_view_pose(graph: KeyframeGraph, edge: ReprojectionFactor) -> Array | None:
+    """(4, 4) j_from_i of an edge by its essential matrix, the step's length 1; None where its matches tell of none."""
     used = edge.weight > 0.1
     if used.sum() < 30:
-        return False
+        return None
     g = graph.intrinsics.values
     f = float(np.exp(g[0]))
     matrix = np.array([[f, 0, g[2]], [0, f, g[3]], [0, 0, 1.0]])
     a, b = graph.variables[edge.i].px[used], edge.target[used].astype(float)
     essential, inlier = cv2.findEssentialMat(a, b, matrix, cv2.USAC_MAGSAC, 0.999, 0.7)
     if essential is None or essential.shape != (3, 3):
-        return False
+        return None
     _, rotation, translation, _ = cv2.recoverPose(essential, a, b, matrix, mask=inlier)
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation, 0.1 * translation[:, 0]
-    graph.set_keyframe_pose(edge.j, pose)
-    return True
+    pose[:3, :3], pose[:3, 3] = rotation, translation[:, 0]
+    return pose
 
 
 def _carry(graph: KeyframeGraph, i: int, j: int) -> None:

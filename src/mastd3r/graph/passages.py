@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
-from .factors import KeyframeVariables, thinned_edge
-from .initialisation import attempt, first_pairs
+from .factors import KeyframeVariables, ReprojectionFactor, thinned_edge
+from .initialisation import attempt, first_pairs, two_view_pose
 from .intrinsics import Intrinsics, as_given
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
@@ -34,12 +35,16 @@ MOST_POINTS = 300  # of a keyframe, for a decision
 KERNEL_PX = 0.5
 LOOKED_AT = 1.1  # times the median passage's cost a weight: another explanation is looked for
 DOUBTFUL = 1.3  # the same: something is wrong there
-MOST_DOUBTED = 6  # passages looked at in one round, the worst first
-ROUNDS = 3
+MOST_DOUBTED, MOST_LONG = 16, 4  # passages looked at in one round, the worst first, and longer ones
+ROUNDS = 6
 BETTER = 0.98  # of the cost, for another explanation to be taken
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
-WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # the same of the chain, before and after a passage is changed
+NEAR = ((KERNEL_PX, 8),)  # the same of the chain, before a passage is changed
+WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
 LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
+LINKS, PAIRS = 3, 2  # that fit worst, and pairs of views across one, that a passage is joined by in turn
+WIDE = ((4.0, 4),)  # kernel and iterations, after which they are compared
+MISFIT_PX = 3.0  # from where a match is wrong
 DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
 
 
@@ -59,7 +64,8 @@ def retake_passages(graph: KeyframeGraph, tried: set[tuple[int, int, int]] | Non
             tried.add(key)
             if _retake(graph, ids):
                 taken += 1
-                break  # the passages beside it have changed
+                tried -= {other for other in tried if other[0] <= ids[-1] and other[1] >= ids[0]}
+                break  # the passages beside it have changed, and it may have another fault
         else:
             break
     return taken
@@ -68,7 +74,7 @@ def retake_passages(graph: KeyframeGraph, tried: set[tuple[int, int, int]] | Non
 def doubtful_passages(graph: KeyframeGraph, times: float = DOUBTFUL) -> list[list[int]]:
     """Passages that cost so many times more for what their matches weigh than others, the worst first.
 
-    Those that touch come as one, too.
+    Those that touch come as one, too, after all that come alone.
 
     None where depths are measured: their scale is not ours to change, and a passage by itself does not know it.
     """
@@ -78,12 +84,10 @@ def doubtful_passages(graph: KeyframeGraph, times: float = DOUBTFUL) -> list[lis
     firsts = [*range(0, len(ids) - LENGTH, STRIDE), len(ids) - LENGTH]
     costs = np.array([_cost_of_weight(graph, ids[n : n + LENGTH]) for n in firsts])
     bound = times * float(np.median(costs))
-    found: list[tuple[float, list[int]]] = []
-    for n in np.flatnonzero(costs > bound):
-        found.append((costs[n], ids[firsts[n] : firsts[n] + LENGTH]))
-        if n and costs[n - 1] > bound:
-            found.append((costs[n], ids[firsts[n - 1] : firsts[n] + LENGTH]))
-    return [passage for _, passage in sorted(found, key=lambda x: -x[0])[:MOST_DOUBTED]]
+    worst_first = sorted(np.flatnonzero(costs > bound), key=lambda n: -costs[n])
+    alone = [ids[firsts[n] : firsts[n] + LENGTH] for n in worst_first]
+    two = [ids[firsts[n - 1] : firsts[n] + LENGTH] for n in worst_first if n and costs[n - 1] > bound]
+    return alone[:MOST_DOUBTED] + two[:MOST_LONG]
 
 
 def _cost_of_weight(graph: KeyframeGraph, ids: Sequence[int]) -> float:
@@ -93,18 +97,16 @@ def _cost_of_weight(graph: KeyframeGraph, ids: Sequence[int]) -> float:
 
 
 def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
-    """Another explanation of one passage, if there is a better one."""
+    """The best of the other explanations of one passage, if it is better."""
     now = thinned(graph, ids)
     cost = solved(now, ((KERNEL_PX, 15),))
     best: tuple[float, State] | None = None
     for start in STARTS:
-        if best is not None:
-            break
         part = thinned(graph, ids)
         if not start(part):
             continue
         found = solved(part, SETTLING)
-        if found < BETTER * cost:
+        if found < (BETTER * cost if best is None else best[0]):
             best = found, state_of(part)
     frames = [graph.keyframes[k].work.index for k in (ids[0], ids[-1])]
     if best is None:
@@ -138,7 +140,64 @@ def _from_two_views(part: KeyframeGraph) -> bool:
     return bool(pairs) and attempt(part, pairs[0]) is not None
 
 
-STARTS: tuple[Start, ...] = (_from_turn, _from_two_views)
+def _from_worst_link(part: KeyframeGraph) -> bool:
+    """Two halves as they are, joined anew where the matches across fit worst, by the essential matrix of two views.
+
+    Depths are those that the poses give: what was seen across a wrong link has adapted to it. A step is as long as
+    steps are in the passage. Of some links and pairs, that is taken which fits best once a wide kernel has seen it.
+    """
+    ids = sorted(part.variables)
+    links = {n: _across(part, ids[:n]) for n in range(1, len(ids))}
+    misfits = {n: _misfit(part, edges) for n, edges in links.items() if edges}
+    poses = {k: part.variables[k].cam_from_world for k in ids}
+    centres = np.array([inverse(poses[k])[:3, 3] for k in ids])
+    step = float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
+    best: tuple[float, State] | None = None
+    for n in sorted(misfits, key=lambda n: -misfits[n])[:LINKS]:
+        for e in sorted(links[n], key=lambda e: -float(e.weight.sum()))[:PAIRS]:
+            pose = two_view_pose(part, e)
+            if pose is None:
+                continue
+            pose[:3, 3] *= step * abs(ids.index(e.j) - ids.index(e.i))
+            later, other = (e.j, pose @ poses[e.i]) if e.j >= ids[n] else (e.i, inverse(pose) @ poses[e.j])
+            for k in ids:
+                part.set_keyframe_pose(k, poses[k] @ inverse(poses[later]) @ other if k >= ids[n] else poses[k])
+            _depths_anew(part)
+            cost = solved(part, WIDE)
+            if best is None or cost < best[0]:
+                best = cost, state_of(part)
+    if best is None:
+        return False
+    put_back(part, best[1], part.intrinsics)
+    return True
+
+
+def _across(part: KeyframeGraph, before: Sequence[int]) -> list[ReprojectionFactor]:
+    """Edges between the keyframes ``before`` and the others."""
+    first = set(before)
+    return [e for e in part.edges if (e.i in first) != (e.j in first)]
+
+
+def _depths_anew(part: KeyframeGraph) -> None:
+    """Depths by the poses that there are, from one for all points of a keyframe."""
+    for k, v in part.variables.items():
+        part.set_depths(k, np.full(len(v.px), float(np.median(v.inv_depth))))
+        part.solve_depths(k)
+
+
+def _misfit(part: KeyframeGraph, edges: Sequence[ReprojectionFactor]) -> float:
+    """Share of the edges' weight that does not fit: w min(r² / MISFIT_PX², 1)."""
+    out = total = 0.0
+    for e in edges:
+        v = part.variables[e.i]
+        j_from_i = part.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
+        r, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, part.intrinsics.values)
+        out += float((e.weight * np.minimum((r**2).sum(1) / MISFIT_PX**2, 1.0)).sum())
+        total += float(e.weight.sum())
+    return out / max(total, 1e-9)
+
+
+STARTS: tuple[Start, ...] = (_from_turn, _from_two_views, _from_worst_link)
 
 
 # -- a passage by itself -----------------------------------------------------------------------------------------
@@ -171,20 +230,20 @@ def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
     return cost
 
 
-def cost_around(graph: KeyframeGraph, ids: Sequence[int]) -> float:
-    """What the whole chain costs once it is solved; of a long one the keyframes around a passage.
+def cost_around(graph: KeyframeGraph, ids: Sequence[int], steps: Sequence[tuple[float, int]] = NEAR) -> float:
+    """What the whole chain costs once it is solved by ``steps``; of a long one the keyframes around a passage.
 
     Those before stay where they are, those after come along.
     """
     members = graph.members()
     if len(members) <= LONG:
-        return [graph.solve_all(iterations, kernel_px, steady=True) for kernel_px, iterations in WHOLE][-1].cost_last
+        return [graph.solve_all(iterations, kernel_px, steady=True) for kernel_px, iterations in steps][-1].cost_last
     first, last = members.index(ids[0]), members.index(ids[-1])
     around = members[max(first - AROUND, 0) : last + AROUND + 1]
     still = frozenset([around[0], *(k for k in around if k < graph.held)])
     window = Window(around, graph.edges_among(around), still, ALL_INTRINSICS, steady=True)
     old_end = graph.variables[around[-1]].cam_from_world
-    cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in WHOLE][-1].cost_last
+    cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in steps][-1].cost_last
     moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end
     graph.transform_keyframes(members[last + AROUND + 1 :], Sim3.from_rigid(moved))
     return cost
@@ -199,11 +258,12 @@ def kept_if_cheaper(
 ) -> tuple[bool, float, float]:
     """Change the graph, and change it back unless the whole costs less around ``ids``: (kept, cost before, and after).
 
+    As it is, the nearest minimum speaks for it: a solve that begins with a wide kernel may end in a worse one.
     ``undo``: takes back what ``change`` did beside poses and depths. ``dearer``: by how much it may cost more.
     """
     before, state, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
     change()
-    after = cost_around(graph, ids)
+    after = cost_around(graph, ids, WHOLE)
     kept = after < before + dearer
     if not kept:
         if undo is not None:
