@@ -18,6 +18,7 @@ from mastd3r.graph.passages import (
     STARTS,
     WHOLE,
     Start,
+    Tried,
     cost_around,
     doubtful_passages,
     kept_if_cheaper,
@@ -135,63 +136,64 @@ def test_measured_depths_have_a_scale_that_is_not_ours_to_change(exact_scene: Ca
     assert graph.depths_measured and doubtful_passages(graph) == [] and retake_passages(graph) == 0
 
 
-def test_a_passage_is_tried_again_only_once_it_has_more_matches(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Graph:
-        edges: tuple[int, ...] = (1, 2)
+class Counted:
+    """As much of a graph as is asked for passages that others make up."""
 
-        def edges_among(self, ids: list[int]) -> tuple[int, ...]:
-            return self.edges
+    edges: tuple[int, ...] = (1, 2)
 
-    bounds, retaken, graph = list[float](), list[list[int]](), Graph()
+    def edges_among(self, _: list[int]) -> tuple[int, ...]:
+        return self.edges
+
+
+def test_a_passage_is_tried_again_once_it_has_more_matches_or_another_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds, retaken, graph, costs = list[float](), list[list[int]](), Counted(), [100.0]
 
     def doubtful(_: Any, times: float) -> list[list[int]]:
         bounds.append(times)
         return [[3, 4]]
 
     monkeypatch.setattr(passages_module, "doubtful_passages", doubtful)
-    monkeypatch.setattr(passages_module, "_retake", lambda _, ids: bool(retaken.append(ids)))
-    tried = set[tuple[int, int, int]]()
-    retake_passages(graph, tried)  # type: ignore[arg-type]
-    retake_passages(graph, tried)  # type: ignore[arg-type]
-    assert len(retaken) == 1 and set(bounds) == {passages_module.LOOKED_AT}
-    graph.edges = (1, 2, 3)
-    retake_passages(graph, tried)  # type: ignore[arg-type]
-    assert len(retaken) == 2
+    monkeypatch.setattr(passages_module, "cost_alone", lambda *_: costs[-1])
+    monkeypatch.setattr(passages_module, "_retake", lambda _, ids, __: bool(retaken.append(ids)))
+    tried = Tried()
+    for edges, cost, count in (((1, 2), 100, 1), ((1, 2), 101, 1), ((1, 2, 3), 101, 2), ((1, 2, 3), 90, 3)):
+        graph.edges = edges
+        costs.append(cost)
+        retake_passages(graph, tried)  # type: ignore[arg-type]
+        assert len(retaken) == count and set(bounds) == {passages_module.LOOKED_AT}
 
 
-def test_where_one_was_taken_the_passages_it_touches_are_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They may have another fault; one elsewhere is as it was."""
-
-    class Graph:
-        def edges_among(self, _: list[int]) -> tuple[int, ...]:
-            return (1,)
-
-    found = {3: 2, 8: 0, 20: 0}  # how often another explanation is found, by the first keyframe
+def test_where_one_was_taken_the_others_are_looked_at_once_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that it changed; one elsewhere costs what it did, and is as it was."""
+    cost = {3: 100.0, 8: 80.0, 20: 120.0}
     retaken = list[int]()
 
-    def retake(_: Any, ids: list[int]) -> bool:
+    def retake(_: Any, ids: list[int], __: float) -> bool:
         retaken.append(ids[0])
-        found[ids[0]] -= 1
-        return found[ids[0]] >= 0
+        if retaken.count(3) != 1 or ids[0] != 3:
+            return False
+        cost.update({3: 60.0, 8: 70.0})
+        return True
 
     monkeypatch.setattr(passages_module, "doubtful_passages", lambda *_: [[20, 29], [8, 17], [3, 12]])
+    monkeypatch.setattr(passages_module, "cost_alone", lambda _, ids: cost[ids[0]])
     monkeypatch.setattr(passages_module, "_retake", retake)
-    assert retake_passages(Graph()) == 2  # type: ignore[arg-type]
-    assert retaken == [20, 8, 3, 8, 3, 8, 3]
+    assert retake_passages(Counted()) == 1  # type: ignore[arg-type]
+    assert retaken == [20, 8, 3, 8, 3]
 
 
 def test_of_several_explanations_the_cheapest_is_taken(
     exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not the first that is better than the one there is."""
-    costs, states = iter([100.0, 90.0, 50.0]), iter(["the first", "the second"])  # as it is, and after either start
+    costs, states = iter([90.0, 50.0]), iter(["the first", "the second"])  # after either start
     taken = list[Any]()
     monkeypatch.setattr(passages_module, "STARTS", (lambda _: True, lambda _: True))
     monkeypatch.setattr(passages_module, "solved", lambda *_: next(costs))
     monkeypatch.setattr(passages_module, "state_of", lambda _: next(states))
     monkeypatch.setattr(passages_module, "replace_passage", lambda _, __, state: taken.append(state))
     monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda _, __, change: (change() is None, 1.0, 1.0))
-    assert passages_module._retake(chain(exact_scene), list(range(14, VIEWS))) and taken == ["the second"]
+    assert passages_module._retake(chain(exact_scene), list(range(14, VIEWS)), 100.0) and taken == ["the second"]
 
 
 def test_what_there_is_is_not_judged_by_a_wide_solve_that_ends_in_a_worse_place(

@@ -26,7 +26,7 @@ from .graph.keyframe_graph import KeyframeGraph
 from .graph.loose import leave_loose
 from .graph.match_noise import learn_match_variance
 from .graph.merging import with_lost_frames
-from .graph.passages import retake_passages
+from .graph.passages import Tried, retake_passages
 from .graph.scale_jumps import mend_scale_jumps
 from .graph.solved_anew import solve_anew
 from .metric.measure import measure
@@ -243,7 +243,7 @@ class Slam:
         learn_match_variance(graph)
         for submap in sorted(graph.started):
             graph.submap = submap
-            tried = set[tuple[int, int, int]]()
+            tried = Tried()
             retake_passages(graph, tried)
             mend_scale_jumps(graph)
             if self.config.graph.loops:
@@ -251,6 +251,7 @@ class Slam:
             add_covisible_pairs(graph, lambda pairs: self.keyframes.edges.add_many(graph, pairs), self._pairs)
             retake_passages(graph, tried)  # more is matched now, which one explanation may fit and another not
             solve_anew(graph)
+            retake_passages(graph, tried)  # what costs another amount than when it was tried
             leave_loose(graph)
             mend_scale_jumps(graph)
         find_lost(self.seen.frames(), graph, Observer(self.parts), self.two_view, self._given_up)

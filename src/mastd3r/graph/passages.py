@@ -28,6 +28,7 @@ from .windows import ALL_INTRINSICS, Window
 
 Array = NDArray[Any]
 Start = Callable[[KeyframeGraph], bool]
+Tried = dict[tuple[int, int, int], float]  # cost of passages, by first and last keyframe and edges
 State = dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of keyframes
 log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
@@ -38,6 +39,7 @@ DOUBTFUL = 1.3  # the same: something is wrong there
 MOST_DOUBTED, MOST_LONG = 16, 4  # passages looked at in one round, the worst first, and longer ones
 ROUNDS = 6
 BETTER = 0.98  # of the cost, for another explanation to be taken
+CHANGED = 0.02  # of the cost, from which a passage is tried again
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
 NEAR = ((KERNEL_PX, 8),)  # the same of the chain, before a passage is changed
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
@@ -48,24 +50,23 @@ MISFIT_PX = 3.0  # from where a match is wrong
 DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
 
 
-def retake_passages(graph: KeyframeGraph, tried: set[tuple[int, int, int]] | None = None) -> int:
+def retake_passages(graph: KeyframeGraph, tried: Tried | None = None) -> int:
     """Try other explanations of badly explained passages of the submap being tracked; how many were taken.
 
-    ``tried``: first and last keyframe and edges of passages that are not tried again; those that are tried are added.
-    One is taken where it costs less than ``BETTER`` of what the passage does, on matches of the passage alone, and
-    where it lowers the cost of the whole chain too.
+    ``tried``: passages that are not tried again, unless they cost ``CHANGED`` more or less by now; those that are
+    tried are added. One is taken where it costs less than ``BETTER`` of what the passage does, on matches of the
+    passage alone, and where it lowers the cost of the whole chain too.
     """
-    taken, tried = 0, set[tuple[int, int, int]]() if tried is None else tried
+    taken, tried = 0, Tried() if tried is None else tried
     for _ in range(ROUNDS):
         for ids in doubtful_passages(graph, LOOKED_AT):
-            key = (ids[0], ids[-1], len(graph.edges_among(ids)))
-            if key in tried:
+            key, cost = (ids[0], ids[-1], len(graph.edges_among(ids))), cost_alone(graph, ids)
+            if abs(tried.get(key, np.inf) - cost) <= CHANGED * cost:
                 continue
-            tried.add(key)
-            if _retake(graph, ids):
+            tried[key] = cost
+            if _retake(graph, ids, cost):
                 taken += 1
-                tried -= {other for other in tried if other[0] <= ids[-1] and other[1] >= ids[0]}
-                break  # the passages beside it have changed, and it may have another fault
+                break  # the passages beside it have changed
         else:
             break
     return taken
@@ -96,10 +97,13 @@ def _cost_of_weight(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     return solved(part, ((KERNEL_PX, 4),)) / max(weight, 1e-9)
 
 
-def _retake(graph: KeyframeGraph, ids: Sequence[int]) -> bool:
-    """The best of the other explanations of one passage, if it is better."""
-    now = thinned(graph, ids)
-    cost = solved(now, ((KERNEL_PX, 15),))
+def cost_alone(graph: KeyframeGraph, ids: Sequence[int]) -> float:
+    """What a passage costs by itself, in the nearest minimum."""
+    return solved(thinned(graph, ids), ((KERNEL_PX, 15),))
+
+
+def _retake(graph: KeyframeGraph, ids: Sequence[int], cost: float) -> bool:
+    """The best of the other explanations of one passage, if it is better than the one there is, of this ``cost``."""
     best: tuple[float, State] | None = None
     for start in STARTS:
         part = thinned(graph, ids)
