@@ -19,7 +19,7 @@ from mastd3r.graph.factors import ReprojectionFactor
 from mastd3r.graph.intrinsics import intrinsics_for
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.pose_graph import Loop, optimise_pose_graph
-from mastd3r.tracking.loop_closure import add_covisible_pairs, close_loops
+from mastd3r.tracking.loop_closure import _put_loose_parts, _Seen, add_covisible_pairs, close_loops
 from mastd3r.tracking.two_view import SURE_INLIERS, TwoView
 from mastd3r.types import PairPrediction, Pointmap
 
@@ -260,7 +260,7 @@ class Several(Recognises):
         self.pairs = pairs
 
     def best(self, graph: KeyframeGraph, seen: Any, among: list[int], count: int, least: float) -> list[Any]:
-        return [graph.keyframes[i] for i, j in self.pairs if j == seen.index and i in among]
+        return [graph.keyframes[i] for i, j in self.pairs if j == seen.index and i in among][:count]
 
     def relocalised(self, kf: Any, work: Any, prior: Array) -> TwoView | None:
         view = super().relocalised(kf, work, prior)
@@ -273,24 +273,28 @@ class Several(Recognises):
 
 
 @pytest.mark.parametrize(
-    ("pairs", "passages", "believed"),
+    ("pairs", "passages", "loose", "believed"),
     [
-        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[5, 6, 7]], True),
-        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [], False),  # tracking was good all the way: they look alike
-        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[11]], False),
-        ({(0, 8): 0.0, (1, 9): 0.0}, [[5, 6, 7]], False),
-        ({(0, 8): 0.0, (1, 9): -0.2, (2, 10): -0.4}, [[5, 6, 7]], False),  # no two say the same
-        ({(0, 8): 0.0, (0, 9): 0.0, (0, 10): 0.0}, [[5, 6, 7]], False),  # one picture that looks like many
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[5, 6, 7]], [], True),
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [], [], False),  # tracking was good all the way: they look alike
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [[11]], [], False),
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [], [[7, 8, 9, 10, 11]], True),  # hardly anything holds these
+        ({(0, 8): 0.0, (1, 9): 0.0, (2, 10): 0.0}, [], [[11]], False),
+        ({(0, 8): 0.0, (1, 9): 0.0}, [[5, 6, 7]], [], False),
+        ({(0, 8): 0.0, (1, 9): -0.2, (2, 10): -0.4}, [[5, 6, 7]], [], False),  # no two say the same
+        ({(0, 8): 0.0, (0, 9): 0.0, (0, 10): 0.0}, [[5, 6, 7]], [], False),  # one picture that looks like many
     ],
 )
 def test_a_large_turn_needs_a_bad_passage_and_loops_that_agree(
     scene: Any,
     pairs: dict[tuple[int, int], float],
     passages: list[list[int]],
+    loose: list[list[int]],
     believed: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("mastd3r.tracking.loop_closure.doubtful_passages", lambda *_: passages)
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.loose_parts", lambda *_: loose)
     retaken: list[KeyframeGraph] = []
     monkeypatch.setattr("mastd3r.tracking.loop_closure.retake_passages", retaken.append)
     graph, centres = drifted(scene, turn=np.array([0, 0, 0, 0, 0.75, 0.0]))
@@ -305,6 +309,34 @@ def test_a_large_turn_needs_a_bad_passage_and_loops_that_agree(
     assert all(words.startswith("one place" if believed else "not believed") for words in said.values())
     if believed:
         assert off(graph, centres) < 0.6 * before
+
+
+@pytest.mark.parametrize("part", [range(WEAK, VIEWS), range(WEAK)])
+def test_a_part_that_nothing_holds_goes_where_a_loop_puts_it(
+    scene: Any, monkeypatch: pytest.MonkeyPatch, part: range
+) -> None:
+    """At once and as it is, however far off and of whatever size: drift that were spread would bend all."""
+    graph, centres = drifted(scene, scale=8.0, turn=np.array([0.3, 0, 0, 0, 1.6, 0.0]))
+    assert off(graph, centres) > 0.1
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.loose_parts", lambda *_: [list(part)])
+    i, j = 1, VIEWS - 2
+    seen = Loop(i, j, Sim3.from_rigid(scene.j_from_i(i, j)).in_lengths(8.0), 100.0)
+    view: Any = None
+    _put_loose_parts(graph, [])
+    assert off(graph, centres) > 0.1
+    _put_loose_parts(graph, [_Seen(seen, view, view, 1.6, 1.0)])
+    assert off(graph, centres) < 1e-6
+
+
+def test_who_has_said_enough_gives_others_a_say(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two keyframes look like all that come later, most of all; a third one that does is asked after them."""
+    monkeypatch.setattr("mastd3r.tracking.loop_closure.retake_passages", lambda *_: None)
+    graph, centres = drifted(scene, turn=np.array([0, 0, 0, 0, 0.75, 0.0]))
+    before = off(graph, centres)
+    front = Several(scene, graph, {(i, j): 0.0 for j in range(WEAK, VIEWS) for i in range(3)})
+    loops = close_loops(front, graph, front)  # type: ignore[arg-type]
+    assert {x.i for x in loops} == {0, 1, 2}
+    assert off(graph, centres) < 0.6 * before
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from ..geometry.se3 import inverse, so3_log
 from ..geometry.sim3 import Sim3
 from ..graph.covisibility import nearby, overlaps
 from ..graph.keyframe_graph import Keyframe, KeyframeGraph
+from ..graph.loose import loose_parts
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
@@ -37,6 +38,7 @@ OVERLAP_DEPTHS = 3.0  # typical depths within which two views may show one place
 BROKEN = 2.0  # times the median passage's cost for its weight: there tracking may have lost its way altogether
 VOTES = 3  # keyframes at either end of loops that agree, for more than that to be believed
 NEAR_ENDS, SAME_TURN, SAME_GAP = 8, 0.15, 0.05  # keyframes, rad, and share of the way, within which loops agree
+SAME_SHARE = 0.2  # of the drift that they ask for, where that is more: the chain between their ends is off as well
 SEEN_TOGETHER = 0.5  # rad between two views that may see the same
 LONG_BEFORE = 8  # keyframes; those nearer are matched as neighbours
 COVISIBLE_OVERLAP, COVISIBLE_MOTION = 0.25, 0.6  # share in view, and image motion / width, of a pair matched at the end
@@ -59,8 +61,9 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     """Keyframes of the submap being tracked that look alike, far apart in time: verified both ways, and closed.
 
     Each becomes an edge, the drift between its ends is spread over the chain, and everything is optimised. One that
-    asks for more drift than there can be is believed only across a passage that is badly explained, and only together
-    with others that say the same: two places may look alike. Once such have been closed, the rest are asked again.
+    asks for more drift than there can be is believed only across a passage that is badly explained, or that next to
+    nothing holds together, and only with others that say the same: two places may look alike. Once such have been
+    closed, the rest are asked again.
     """
     found, doubted = list[_Seen](), list[_Seen]()
     joined, chain = graph.connected_pairs(), _Chain(graph)
@@ -83,6 +86,7 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     if len(graph.keyframes) >= MANY:
         getattr(two_view.parts.features, "forget", lambda: None)()
         give_back_memory()
+    _put_loose_parts(graph, voted)
     _close(graph, found)
     if voted:  # the ends of what was badly explained have moved far
         retake_passages(graph)
@@ -101,6 +105,18 @@ def _close(graph: KeyframeGraph, found: list[_Seen]) -> None:
     if found:
         optimise_pose_graph(graph, [seen.loop for seen in found])
         graph.solve_all(10, 2.0, steady=True)
+
+
+def _put_loose_parts(graph: KeyframeGraph, voted: list[_Seen]) -> None:
+    """A part that next to nothing holds goes where loops put it, as it is: the drift lies at its link."""
+    for part in loose_parts(graph) if voted else []:
+        inside = set(part)
+        loop = next((s.loop for s in voted if (s.loop.i in inside) != (s.loop.j in inside)), None)
+        if loop is None:
+            continue
+        cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (loop.i, loop.j))
+        put = cam_i.inverse() @ loop.j_from_i.inverse() @ cam_j
+        graph.transform_keyframes(part, put if loop.j in inside else put.inverse())
 
 
 class _Chain:
@@ -155,9 +171,17 @@ def _connect(graph: KeyframeGraph, seen: _Seen) -> None:
 
 
 def _voted_for(graph: KeyframeGraph, doubted: list[_Seen]) -> list[_Seen]:
-    """Of loops that would move much, those that agree with most others, if a badly explained passage lies between."""
-    passages = doubtful_passages(graph) if len(doubted) >= VOTES else []
-    across = [s for s in doubted if any(s.loop.i <= p[-1] and p[0] <= s.loop.j for p in passages)]
+    """Of loops that would move much, those that agree with most others, if tracking may have broken between."""
+    if len(doubted) < VOTES:
+        return []
+    passages = doubtful_passages(graph)
+    loose = [set(part) for part in loose_parts(graph)]
+    across = [
+        s
+        for s in doubted
+        if any(s.loop.i <= p[-1] and p[0] <= s.loop.j for p in passages)
+        or any((s.loop.i in part) != (s.loop.j in part) for part in loose)
+    ]
     best: list[_Seen] = []
     for one in across:
         agree = [other for other in across if _say_the_same(graph, one, other)]
@@ -181,7 +205,9 @@ def _say_the_same(graph: KeyframeGraph, a: _Seen, b: _Seen) -> bool:
     by_a = (pose[other.j] @ pose[one.j].inverse()) @ one.j_from_i @ (pose[one.i] @ pose[other.i].inverse())
     turn = float(np.linalg.norm(so3_log(by_a.rotation @ other.j_from_i.rotation.T)))
     gap = float(np.linalg.norm(by_a.translation - other.j_from_i.translation))
-    return turn <= SAME_TURN and gap <= SAME_GAP * min(_way(graph, one.i, one.j), _way(graph, other.i, other.j))
+    turn_most = max(SAME_TURN, SAME_SHARE * min(a.drift, b.drift))
+    gap_most = max(SAME_GAP, SAME_SHARE * min(a.gap_ratio, b.gap_ratio))
+    return turn <= turn_most and gap <= gap_most * min(_way(graph, one.i, one.j), _way(graph, other.i, other.j))
 
 
 def _alike(two_view: TwoViewEstimator, graph: KeyframeGraph, j: int, far: list[int]) -> list[Keyframe]:
@@ -198,9 +224,15 @@ def _known(found: list[_Seen], i: int, j: int) -> bool:
 
 
 def _enough_of(doubted: list[_Seen], i: int, j: int) -> bool:
-    """Two places that look alike do so from all around: after twice the votes that are needed nobody else is asked."""
-    near = [s for s in doubted if abs(i - s.loop.i) <= NEAR_ENDS and abs(j - s.loop.j) <= NEAR_ENDS]
-    return len(near) >= 2 * VOTES
+    """Whether i need not be asked: it has said enough, or so many around it that it adds nothing.
+
+    Two places that look alike do so from all around, so as many keyframes are to say so at either end.
+    """
+    near = [s.loop for s in doubted if abs(i - s.loop.i) <= NEAR_ENDS and abs(j - s.loop.j) <= NEAR_ENDS]
+    if sum(loop.i == i for loop in near) >= VOTES:
+        return True
+    told = min(len({loop.i for loop in near}), len({loop.j for loop in near})) >= VOTES
+    return len(near) >= (2 if told else 4) * VOTES
 
 
 def _strong(view: TwoView | None) -> bool:
