@@ -257,6 +257,9 @@ def test_figures_read_well() -> None:
     counted = {"frames": 9, "frames_posed": 8, "frames_tracked": 5, "frames_interpolated": 3, "frames_lost": 1}
     assert summary_line(counted) == "5 of 9 frames tracked (3 interpolated, 1 lost)"
     assert summary_line({**counted, "frames_interpolated": 0, "frames_lost": 0}) == "5 of 9 frames tracked"
+    over_all = {"psnr_holdout": 14.02, "psnr_holdout_static": None}
+    assert summary_line(over_all) == "PSNR 14.02 dB"  # nobody has said what moves
+    assert summary_line({**over_all, "psnr_holdout_static": 29.9}) == "PSNR of what is static 29.90 dB"
     given = {"odd": 1, "gaussians": 2, "ate_rmse_all": None, "ate_rmse_all_note": "still", "frames": 3}
     assert [k for k, _ in in_order(given)] == [
         "frames",

@@ -103,7 +103,7 @@ def shown(key: str, value: Any) -> str:
 
 
 def summary_line(metrics: Mapping[str, Any]) -> str:
-    """The run in one line."""
+    """The run in one line. What moves is not in the splat: where truth tells what is static, PSNR is over that."""
     parts = []
     if metrics.get("frames"):
         if "frames_tracked" not in metrics:
@@ -112,8 +112,9 @@ def summary_line(metrics: Mapping[str, Any]) -> str:
             others = [f"{metrics[f'frames_{s}']} {s}" for s in ("interpolated", "lost") if metrics[f"frames_{s}"]]
             rest = f" ({', '.join(others)})" if others else ""
             parts.append(f"{metrics['frames_tracked']} of {metrics['frames']} frames tracked{rest}")
-    short = {"ate_rmse_all": "ATE", "psnr_holdout": "PSNR", "mask_iou": "mask IoU"}
-    short |= {"fps_total": "", "peak_rss_mib": ""}
+    static = metrics.get("psnr_holdout_static") is not None
+    psnr = {"psnr_holdout_static": "PSNR of what is static"} if static else {"psnr_holdout": "PSNR"}
+    short = {"ate_rmse_all": "ATE"} | psnr | {"mask_iou": "mask IoU", "fps_total": "", "peak_rss_mib": ""}
     for key, name in short.items():
         if metrics.get(key) is not None:
             parts.append(f"{name} {shown(key, metrics[key])}".strip())
