@@ -84,3 +84,18 @@ def test_what_cannot_be_joined_is_given_up_after_the_last_frame(scene: Any, monk
     keyframes.finish(SimpleNamespace(last=None))  # type: ignore[arg-type]
     keyframes.close()
     assert len(graph.keyframes) == VIEWS - 2 and graph.submap == 1 and not keyframes.edges.flows
+
+
+def test_keyframes_that_were_let_go_are_gone_after_the_last_frame(scene: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They have neither poses nor depths: left there, they would be placed by continuity."""
+    graph = with_a_small_piece(scene)
+    gone = {0, 1}
+    graph.submap_of.update(dict.fromkeys(gone, 9))
+    monkeypatch.setattr(keyframes_module, "join_recognised", lambda *_: False)
+    source: Any = SimpleNamespace(size=(scene.width, scene.height), has_depth=False, has_semantic=False)
+    parts = build_parts(replace(Config(), pointmaps="geometric", semantics="none", features="orb"), source)
+    keyframes = Keyframes(Config(), parts, graph, SimpleNamespace(parts=parts))  # type: ignore[arg-type]
+    keyframes.finish(SimpleNamespace(last=None))  # type: ignore[arg-type]
+    keyframes.close()
+    assert len(graph.keyframes) == VIEWS - 2 and set(graph.submap_of.values()) == graph.started
+    assert [r.state for r in graph.records[:2]] == ["lost", "lost"]

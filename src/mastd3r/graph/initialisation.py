@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -154,11 +154,11 @@ def _settle_on_most(graph: KeyframeGraph) -> float:
     must explain more matches than one that is near.
     """
     for bound_px in (6.0, 4.0, 3.0, 2.0):
-        errors = zip(graph.edges, _errors_px(graph), strict=True)
+        errors = zip(graph.edges, errors_px(graph, graph.edges), strict=True)
         edges = [replace(e, weight=np.where(r < bound_px, e.weight, 0.0)) for e, r in errors]
         _solve_all(graph, edges, 10)
     left_out = total = 0.0
-    for e, r in zip(graph.edges, _errors_px(graph), strict=True):
+    for e, r in zip(graph.edges, errors_px(graph, graph.edges), strict=True):
         left_out += float((e.weight * np.minimum((r / FITS_PX) ** 2, 1.0)).sum())
         total += float(e.weight.sum())
     found = graph.intrinsics
@@ -166,10 +166,10 @@ def _settle_on_most(graph: KeyframeGraph) -> float:
     return left_out + FOCAL_DOUBT * total * float(unusual)
 
 
-def _errors_px(graph: KeyframeGraph) -> list[Array]:
+def errors_px(graph: KeyframeGraph, edges: Sequence[ReprojectionFactor]) -> list[Array]:
     """(p,) distance in pixels of every match from where poses and depths put it, an array an edge."""
     out = []
-    for e in graph.edges:
+    for e in edges:
         v = graph.variables[e.i]
         j_from_i = graph.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
         residual, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, graph.intrinsics.values)
@@ -179,7 +179,7 @@ def _errors_px(graph: KeyframeGraph) -> list[Array]:
 
 def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
     """Matches far from the start lose their weight; (p,) share that every keyframe's points keep, 1 without any."""
-    errors = _errors_px(graph)
+    errors = errors_px(graph, graph.edges)
     used = np.concatenate([r[e.weight > USABLE_WEIGHT] for e, r in zip(graph.edges, errors, strict=True)])
     bound_px = max(3.0, 5.0 * float(np.median(used)))  # a lens that is distorted more than known moves the most
     kept = {k: np.zeros((2, len(v.px))) for k, v in graph.variables.items()}
@@ -193,7 +193,7 @@ def _without_what_is_left(graph: KeyframeGraph) -> dict[int, Array]:
 def _agreement(graph: KeyframeGraph) -> float:
     """Share of all weighted matches within 2 px of where poses and depths put them."""
     used = [e.weight > USABLE_WEIGHT for e in graph.edges]
-    close = sum(int((r[u] < 2.0).sum()) for r, u in zip(_errors_px(graph), used, strict=True))
+    close = sum(int((r[u] < 2.0).sum()) for r, u in zip(errors_px(graph, graph.edges), used, strict=True))
     return close / max(sum(int(u.sum()) for u in used), 1)
 
 

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..geometry.reprojection_kernels import edge_residuals
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from .factors import KeyframeVariables, ReprojectionFactor, thinned_edge
-from .initialisation import attempt, first_pairs, two_view_pose
+from .initialisation import attempt, errors_px, first_pairs, two_view_pose
 from .intrinsics import Intrinsics, as_given
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
@@ -192,11 +191,8 @@ def _depths_anew(part: KeyframeGraph) -> None:
 def _misfit(part: KeyframeGraph, edges: Sequence[ReprojectionFactor]) -> float:
     """Share of the edges' weight that does not fit: w min(r² / MISFIT_PX², 1)."""
     out = total = 0.0
-    for e in edges:
-        v = part.variables[e.i]
-        j_from_i = part.variables[e.j].cam_from_world @ inverse(v.cam_from_world)
-        r, _ = edge_residuals(v.px, v.inv_depth, e.target.astype(float), j_from_i, part.intrinsics.values)
-        out += float((e.weight * np.minimum((r**2).sum(1) / MISFIT_PX**2, 1.0)).sum())
+    for e, r in zip(edges, errors_px(part, edges), strict=True):
+        out += float((e.weight * np.minimum((r / MISFIT_PX) ** 2, 1.0)).sum())
         total += float(e.weight.sum())
     return out / max(total, 1e-9)
 

@@ -49,8 +49,13 @@ def join(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> None:
     keep, gone = graph.submap_of[i], graph.submap_of[j]
     if graph.held and keep == 0:
         graph.found_in_map(graph.records[-1].index)
+    bring(graph, gone, keep, world_from_seen(graph, i, j, j_from_i))
+
+
+def world_from_seen(graph: KeyframeGraph, i: int, j: int, j_from_i: Sim3) -> Sim3:
+    """From where j is, to where i sees it: what hangs together with j is moved by it. ``j_from_i`` as for ``join``."""
     cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (i, j))
-    bring(graph, gone, keep, cam_i.inverse() @ j_from_i.inverse() @ cam_j)
+    return cam_i.inverse() @ j_from_i.inverse() @ cam_j
 
 
 def bring(graph: KeyframeGraph, gone: int, keep: int, keep_from_gone: Sim3) -> None:

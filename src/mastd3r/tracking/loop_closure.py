@@ -20,7 +20,7 @@ from ..graph.loose import loose_parts
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
-from ..graph.submaps import with_scale
+from ..graph.submaps import with_scale, world_from_seen
 from ..types import USABLE_WEIGHT
 from .places import most_alike, not_unlike
 from .two_view import TwoView, TwoViewEstimator
@@ -114,8 +114,7 @@ def _put_loose_parts(graph: KeyframeGraph, voted: list[_Seen]) -> None:
         loop = next((s.loop for s in voted if (s.loop.i in inside) != (s.loop.j in inside)), None)
         if loop is None:
             continue
-        cam_i, cam_j = (Sim3.from_rigid(graph.variables[k].cam_from_world) for k in (loop.i, loop.j))
-        put = cam_i.inverse() @ loop.j_from_i.inverse() @ cam_j
+        put = world_from_seen(graph, loop.i, loop.j, loop.j_from_i)
         graph.transform_keyframes(part, put if loop.j in inside else put.inverse())
 
 
