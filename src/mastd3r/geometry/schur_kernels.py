@@ -12,7 +12,8 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
-from .reprojection_kernels import N_GLOBAL, N_POSE, AnchorMatches
+from .pose_kernels import edge_poses, to_anchor_pose
+from .reprojection_kernels import N_GLOBAL, N_POSE, AnchorMatches, anchor_cost, anchor_system
 
 Array = NDArray[Any]
 _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", "nogil": True}
@@ -65,29 +66,40 @@ def _mirror(square: Array) -> None:
 
 
 @nb.njit(**_JIT)
-def _gather(n: int, cross: Array, matches: AnchorMatches, to_anchor: Array, values: Array, column: Array) -> int:
+def _gather(
+    n: int, cross: Array, matches: AnchorMatches, to_anchor: Array, blocks: Array, values: Array, column: Array
+) -> int:
     """Fill ``values`` with the row of point ``n`` in E, block after block, and ``column`` with where they begin.
 
-    Returns how many blocks there are: pose i, the poses of those that see it in order, the lens.
+    Returns how many blocks there are, without those that are held: pose i, the poses of those that see it in order,
+    the lens.
     """
-    first, last = matches.of_point[n], matches.of_point[n + 1]
-    count = last - first + 2
-    lens = values[count - 1]
+    m, count = len(to_anchor), 0
+    lens = values[m + 1]  # of the last row nothing else is made before all is seen
     for c in range(B):
         values[0, c] = 0.0
         lens[c] = 0.0
-    for s in range(first, last):
+    if blocks[0] >= 0:
+        count, column[0] = 1, 0
+    for s in range(matches.of_point[n], matches.of_point[n + 1]):
         k = matches.by_point[s]
         e = matches.edge[k]
-        own = values[s - first + 1]
-        column[s - first + 1] = B + B * e
+        if blocks[0] >= 0:
+            for c in range(B):
+                for i in range(B):
+                    values[0, i] += float(cross[k, c]) * to_anchor[e, c, i]
         for c in range(B):
-            v = float(cross[k, c])
-            own[c] = v
             lens[c] += cross[k, B + c]
-            for i in range(B):
-                values[0, i] += v * to_anchor[e, c, i]
-    column[0], column[count - 1] = 0, B + B * len(to_anchor)
+        if blocks[e + 1] >= 0:
+            column[count] = B + B * e
+            for c in range(B):
+                values[count, c] = cross[k, c]
+            count += 1
+    if blocks[m + 1] >= 0:
+        column[count] = B + B * m
+        for c in range(B):
+            values[count, c] = lens[c]
+        count += 1
     return count
 
 
@@ -109,19 +121,26 @@ def _subtract(hess: Array, row: Any, column: Any, a: Array, b: Array, per: float
 
 @nb.njit(**_JIT)
 def eliminate(
-    hess: Array, rhs: Array, cross: Array, matches: AnchorMatches, to_anchor: Array, hdd: Array, bd: Array
+    hess: Array,
+    rhs: Array,
+    cross: Array,
+    matches: AnchorMatches,
+    to_anchor: Array,
+    blocks: Array,
+    hdd: Array,
+    bd: Array,
 ) -> None:
     """H - E D⁻¹ E^T and b - E D⁻¹ b_d, in place: the system of one anchor keyframe without its depths.
 
-    ``hess`` (n, n), ``rhs`` (n,) as ``local_system`` makes them; ``cross`` (k, 12) of its matches; ``hdd``, ``bd``
-    (p,).
+    ``hess`` (n, n), ``rhs`` (n,) as ``local_system`` makes them; ``cross`` (k, 12) of its matches; ``blocks`` (m + 2,)
+    of each six unknowns, -1: they are held, and what is of them in H and b is left as it is; ``hdd``, ``bd`` (p,).
     """
     most = len(to_anchor) + 2
     values, column = np.empty((most, B)), np.empty(most, np.int64)
     for n in range(len(hdd)):
         if matches.of_point[n] == matches.of_point[n + 1]:
             continue
-        count, per = _gather(n, cross, matches, to_anchor, values, column), 1.0 / hdd[n]
+        count, per = _gather(n, cross, matches, to_anchor, blocks, values, column), 1.0 / hdd[n]
         for p in range(count):
             at = np.uintp(column[p])
             for r in range(B):
@@ -133,16 +152,75 @@ def eliminate(
 
 
 @nb.njit(**_JIT)
-def depth_steps(step: Array, cross: Array, matches: AnchorMatches, to_anchor: Array, hdd: Array, bd: Array) -> Array:
-    """(p,) of the depths, from the ``step`` (n,) of the anchor keyframe's other unknowns: D⁻¹ (b_d - E^T x)."""
+def depth_steps(
+    step: Array, cross: Array, matches: AnchorMatches, to_anchor: Array, blocks: Array, hdd: Array, bd: Array
+) -> Array:
+    """(p,) of the depths, from the ``step`` (s, 6) of all blocks: D⁻¹ (b_d - E^T x)."""
     most = len(to_anchor) + 2
     values, column = np.empty((most, B)), np.empty(most, np.int64)
     out = np.empty(len(hdd))
     for n in range(len(hdd)):
         moved = 0.0
         if matches.of_point[n] < matches.of_point[n + 1]:
-            for q in range(_gather(n, cross, matches, to_anchor, values, column)):
+            for q in range(_gather(n, cross, matches, to_anchor, blocks, values, column)):
+                block = blocks[column[q] // B]
                 for c in range(B):
-                    moved += values[q, c] * step[column[q] + c]
+                    moved += values[q, c] * step[block, c]
         out[n] = (bd[n] - moved) / hdd[n]
+    return out
+
+
+# -- all that is made of one anchor keyframe, in one call ------------------------------------------------------------
+
+
+@nb.njit(**_JIT)
+def anchor_part(
+    px: Array, depth: Array, prior: Array, matches: AnchorMatches, poses: Array, ends: Array, blocks: Array, g: Array,
+    kernel_px: float,
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, float]:  # fmt: skip
+    """The system of one anchor keyframe without its depths, and what they follow from.
+
+    Args: px (p, 2); depth (p,) inverse; prior (2, p) its value and information; poses (q, 4, 4) cam_from_world of all
+        keyframes; ends (m + 1,) which of them is the anchor, and which are those of its edges; blocks (m + 2,).
+    Returns: H (n, n), b (n,), E (k, 12), to_anchor (m, 6, 6), H_dd (p,), b_d (p,), H_dd without the prior (p,), cost.
+    """
+    j_from_i = edge_poses(poses, ends)
+    h, b, cross, depth_info, bd, cost = anchor_system(px, depth, matches, j_from_i, g, kernel_px)
+    hdd = depth_info + prior[1] + 1e-9
+    bd += prior[1] * (prior[0] - depth)
+    to_anchor = to_anchor_pose(j_from_i)
+    hess, rhs = local_system(h, b, to_anchor)
+    eliminate(hess, rhs, cross, matches, to_anchor, blocks, hdd, bd)
+    return hess, rhs, cross, to_anchor, hdd, bd, depth_info, cost.sum() + _prior_cost(depth, prior)
+
+
+@nb.njit(**_JIT)
+def anchor_part_cost(
+    px: Array, depth: Array, prior: Array, matches: AnchorMatches, poses: Array, ends: Array, g: Array, kernel_px: float
+) -> float:
+    """The cost that ``anchor_part`` gives, alone."""
+    cost: float = anchor_cost(px, depth, matches, edge_poses(poses, ends), g, kernel_px).sum()
+    return cost + _prior_cost(depth, prior)
+
+
+@nb.njit(**_JIT)
+def _prior_cost(depth: Array, prior: Array) -> float:
+    cost = 0.0
+    for n in range(len(depth)):
+        cost += prior[1, n] * (depth[n] - prior[0, n]) ** 2
+    return cost
+
+
+@nb.njit(**_JIT)
+def moved_depths(
+    depth: Array, step: Array, cross: Array, matches: AnchorMatches, to_anchor: Array, blocks: Array, hdd: Array,
+    bd: Array, at_infinity: float,
+) -> Array:  # fmt: skip
+    """(p,) inverse depths after ``depth_steps``; no step goes on from infinity by more than ``at_infinity`` of the
+    mean inverse depth, and none makes a point less than a quarter, or more than four times, of what it was."""
+    out = depth_steps(step, cross, matches, to_anchor, blocks, hdd, bd)
+    least = at_infinity * np.abs(depth).mean()
+    for n in range(len(out)):
+        down, up = max(0.75 * depth[n], least), 3.0 * abs(depth[n]) + least
+        out[n] = depth[n] + min(max(out[n], -down), up)
     return out

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from ..concurrency import give_back_memory, on_two_threads
 from ..geometry.least_squares import Damping, damped_solve, levenberg_marquardt
-from ..geometry.reprojection_kernels import N_GLOBAL, AnchorMatches, anchor_cost, anchor_system
-from ..geometry.schur_kernels import depth_steps, eliminate, local_system
-from ..geometry.se3 import adjoint, inverse, se3_exp
+from ..geometry.pose_kernels import moved_poses
+from ..geometry.reprojection_kernels import N_GLOBAL, AnchorMatches
+from ..geometry.schur_kernels import anchor_part, anchor_part_cost, moved_depths
+from ..geometry.se3 import inverse
 from .factors import Factors, ReprojectionFactor, Variables
 from .intrinsics import Intrinsics
-from .normal_equations import DENSE_MOST, BlockPattern, DenseEquations, SparseEquations, unknowns
+from .normal_equations import DENSE_MOST, BlockPattern, DenseEquations, SparseEquations
 from .steady_speed import SteadySpeed
 
 Array = NDArray[Any]
@@ -61,15 +62,15 @@ def solve(
     ``speed``: what is asked of keyframes in a row.
     """
     problem = _Problem(variables, edges, intrinsics, fixed, kernel_px, speed)
-    poses = {k: v.cam_from_world for k, v in variables.items()}
+    poses = np.stack([v.cam_from_world for v in variables.values()]).astype(float)
     start = _Estimate(problem, poses, {k: v.inv_depth for k, v in variables.items()}, intrinsics.values)
     found = levenberg_marquardt(start, DAMPING, iterations=iterations, tolerance=tolerance)
     end, anchors = found.estimate, list(problem.by_anchor)
     poses, depths = end.poses, end.depths
     if anchors and len(fixed) == 1:
-        poses, depths = _facing_scene(end, anchors, min(fixed))
-    for k, v in variables.items():
-        v.cam_from_world, v.inv_depth = poses[k], depths[k]
+        poses, depths = _facing_scene(end, anchors, problem.row_of[min(fixed)])
+    for (k, v), pose in zip(variables.items(), poses, strict=True):
+        v.cam_from_world, v.inv_depth = pose.copy(), depths[k]
     for i in anchors:
         v = variables[i]
         v.inv_depth = np.maximum(v.inv_depth, AT_INFINITY * _typical(v.inv_depth))
@@ -86,7 +87,6 @@ def solve(
 class _AnchorTerm:
     """What one anchor keyframe contributes in one iteration, kept for the back-substitution."""
 
-    blocks: Array  # block of each six local columns, -1 = fixed
     cross: Array | None  # (k, 12) E of its matches; None where it is made once more when it is needed
     to_anchor: Array  # (m, 6, 6)
     hdd: Array
@@ -110,22 +110,22 @@ class _Problem:
         self.by_anchor: Factors = {}
         for edge in edges:
             self.by_anchor.setdefault(edge.i, []).append(edge)
-        self.block_of = {k: n for n, k in enumerate(k for k in variables if k not in fixed)}
-        self.lens = len(self.block_of)  # the last block
-        self.speed = speed if speed is not None and len(speed.ids) else None
-        rows = () if self.speed is None else self.speed.ids.tolist()
-        self.in_a_row = [np.array([self.block_of.get(k, -1) for k in row]) for row in rows]
+        self.row_of = {k: n for n, k in enumerate(variables)}  # of poses
+        free = [k not in fixed for k in variables]
+        self.block_of = np.where(free, np.cumsum(free) - 1, -1)  # (q,) of poses, -1 = fixed
+        self.lens = sum(free)  # the last block
+        self.ends = {i: np.array([self.row_of[k] for k in (i, *(e.j for e in of))]) for i, of in self.by_anchor.items()}
+        lens = self.lens if intrinsics.free.any() else -1
+        self.blocks = {i: np.append(self.block_of[ends], lens) for i, ends in self.ends.items()}
+        self.speed = speed.by_rows(self.row_of) if speed is not None and len(speed.ids) else None
+        self.in_a_row = [] if self.speed is None else list(self.block_of[self.speed.ids])
         self.terms: dict[int, _AnchorTerm] = {}
         self._matches: dict[int, AnchorMatches] = {}
+        self._priors: dict[int, Array] = {}
         self.pattern: BlockPattern | None = None
         if self.lens >= DENSE_MOST:
-            groups = [*(self.blocks_of(i) for i in self.by_anchor), *self.in_a_row]
+            groups = [*self.blocks.values(), *self.in_a_row]
             self.pattern = BlockPattern(self.lens + 1, [g[g >= 0] for g in groups])
-
-    def blocks_of(self, i: int) -> Array:
-        """(m + 2,) blocks of an anchor keyframe, of those that it is matched with, and of the lens; -1 = fixed."""
-        ends = (self.block_of.get(k, -1) for k in (i, *(edge.j for edge in self.by_anchor[i])))
-        return np.array([*ends, self.lens])
 
     def matches(self, i: int) -> AnchorMatches:
         """Those of an anchor keyframe; of a long video they are not kept, but made whenever they are asked for."""
@@ -135,6 +135,15 @@ class _Problem:
             found = AnchorMatches.of([e.target for e in edges], [e.weight for e in edges])
             if self.pattern is None:
                 self._matches[i] = found
+        return found
+
+    def prior(self, i: int) -> Array:
+        """(2, p) of an anchor keyframe's depths: value and information."""
+        found = self._priors.get(i)
+        if found is None:
+            found = np.stack([self.variables[i].prior_depth, self.variables[i].prior_info])
+            if self.pattern is None:
+                self._priors[i] = found
         return found
 
     def parts(self) -> Iterator[list[int]]:
@@ -148,7 +157,7 @@ class _Estimate:
     """Values of all unknowns."""
 
     problem: _Problem
-    poses: dict[int, Array]  # cam_from_world (4, 4) of each keyframe
+    poses: Array  # (q, 4, 4) cam_from_world of all keyframes
     depths: dict[int, Array]  # (p,) inverse
     g: Array  # (6,) intrinsics
 
@@ -157,107 +166,77 @@ class _Estimate:
         problem, intrinsics = self.problem, self.problem.intrinsics
         pattern = problem.pattern
         equations = DenseEquations(problem.lens + 1) if pattern is None else SparseEquations(pattern)
-        rhs = np.zeros(6 * (problem.lens + 1))
         total, held = self._prior_cost(), ~intrinsics.free
         for some in problem.parts():
             for i, (term, local_h, local_b, cost) in zip(some, on_two_threads(self._anchor_part, some), strict=True):
                 total += cost
                 problem.terms[i] = term
                 local_h[-N_GLOBAL:][held], local_h[:, -N_GLOBAL:][:, held], local_b[-N_GLOBAL:][held] = 0.0, 0.0, 0.0
-                _add(equations, rhs, term.blocks, local_h, local_b)
+                equations.add(problem.blocks[i], local_h, local_b)
                 if pattern is not None:
                     term.cross = None
         if problem.speed is not None:
             for blocks, part_h, part_b in zip(problem.in_a_row, *problem.speed.system(self.poses), strict=True):
-                _add(equations, rhs, blocks, part_h, part_b)
-        prior_info = np.where(held, 0.0, intrinsics.prior_info)
-        equations.add(np.array([problem.lens]), np.diag(prior_info))
-        rhs[-N_GLOBAL:] += prior_info * (intrinsics.prior - self.g)
+                equations.add(blocks, part_h, part_b)
+        info = np.where(held, 0.0, intrinsics.prior_info)
+        equations.add(np.array([problem.lens]), np.diag(info), info * (intrinsics.prior - self.g))
         if pattern is not None:
             give_back_memory()  # what the parts were made in, before the system is factorised
-        return equations.matrix(), rhs, total
+        return equations.matrix(), equations.rhs, total
 
     def cost(self) -> float:
         """The robust cost, priors included."""
         problem = self.problem
 
         def one(i: int) -> float:
-            given = problem.variables[i].px, self.depths[i], problem.matches(i), self._j_from_i(i)
-            return float(anchor_cost(*given, self.g, problem.kernel_px).sum())
+            return float(anchor_part_cost(*self._given(i), self.g, problem.kernel_px))
 
         return self._prior_cost() + sum(on_two_threads(one, list(problem.by_anchor)))
 
     def moved(self, step: Array) -> _Estimate:
         """The estimate after a step of poses and intrinsics, with the depths that follow from it."""
-        poses, depths = dict(self.poses), dict(self.depths)
-        of_block = step.reshape(-1, 6)
-        for k, block in self.problem.block_of.items():
-            poses[k] = se3_exp(of_block[block]) @ self.poses[k]
+        depths, of_block = dict(self.depths), step.reshape(-1, 6)
+        poses = moved_poses(self.poses, self.problem.block_of, of_block)
         for some in self.problem.parts():
-            for i, delta in zip(some, on_two_threads(lambda i: self._depth_step(i, of_block), some), strict=True):
-                depth = self.depths[i]
-                least = STEP_AT_INFINITY * _typical(depth)
-                depths[i] = depth + np.clip(delta, -np.maximum(0.75 * depth, least), 3.0 * np.abs(depth) + least)
+            moved = on_two_threads(lambda i: self._moved_depths(i, of_block), some)
+            depths.update(zip(some, moved, strict=True))
         return _Estimate(self.problem, poses, depths, self.g + step[-N_GLOBAL:])
 
-    def _depth_step(self, i: int, of_block: Array) -> Array:
-        """(p,) of an anchor's depths, from the step (n, 6) of all blocks."""
+    def _moved_depths(self, i: int, of_block: Array) -> Array:
+        """(p,) of an anchor keyframe, after the step (n, 6) of all blocks."""
         term = self.problem.terms[i]
         cross = self._anchor_part(i)[0].cross if term.cross is None else term.cross
-        local = np.where(term.blocks[:, None] >= 0, of_block[term.blocks], 0.0).reshape(-1)
-        found: Array = depth_steps(local, cross, self.problem.matches(i), term.to_anchor, term.hdd, term.bd)
+        of = cross, self.problem.matches(i), term.to_anchor, self.problem.blocks[i], term.hdd, term.bd
+        found: Array = moved_depths(self.depths[i], of_block, *of, STEP_AT_INFINITY)
         return found
 
-    def _j_from_i(self, i: int) -> Array:
-        """(m, 4, 4) of an anchor keyframe's edges."""
-        world_from_anchor = inverse(self.poses[i])
-        return np.stack([self.poses[e.j] @ world_from_anchor for e in self.problem.by_anchor[i]])
+    def _given(self, i: int) -> tuple[Array, Array, Array, AnchorMatches, Array, Array]:
+        problem = self.problem
+        v = problem.variables[i]
+        return v.px, self.depths[i], problem.prior(i), problem.matches(i), self.poses, problem.ends[i]
 
     def _anchor_part(self, i: int) -> tuple[_AnchorTerm, Array, Array, float]:
         """What an anchor keyframe's depths are eliminated with, its part of the system without them, its cost."""
-        problem, v, depth = self.problem, self.problem.variables[i], self.depths[i]
-        matches, j_from_i = problem.matches(i), self._j_from_i(i)
-        h, b, cross, depth_info, bd, cost = anchor_system(v.px, depth, matches, j_from_i, self.g, problem.kernel_px)
-        hdd = depth_info + v.prior_info + 1e-9
-        bd += v.prior_info * (v.prior_depth - depth)
-        to_anchor = -np.stack([adjoint(t) for t in j_from_i])  # J_i = -J_j Ad(j_from_i)
-        local_h, local_b = local_system(h, b, to_anchor)
-        eliminate(local_h, local_b, cross, matches, to_anchor, hdd, bd)
-        term = _AnchorTerm(problem.blocks_of(i), cross, to_anchor, hdd, bd, depth_info)
-        return term, local_h, local_b, float(cost.sum())
+        problem = self.problem
+        h, b, *kept, cost = anchor_part(*self._given(i), problem.blocks[i], self.g, problem.kernel_px)
+        return _AnchorTerm(*kept), h, b, float(cost)
 
     def _prior_cost(self) -> float:
-        variables, intrinsics = self.problem.variables, self.problem.intrinsics
+        """Of what no anchor keyframe has a part in."""
+        intrinsics, speed = self.problem.intrinsics, self.problem.speed
         free = intrinsics.free
         total = float((intrinsics.prior_info[free] * (self.g - intrinsics.prior)[free] ** 2).sum())
-        total += 0.0 if self.problem.speed is None else self.problem.speed.cost(self.poses)
-        for i in self.problem.by_anchor:
-            v = variables[i]
-            total += float((v.prior_info * (self.depths[i] - v.prior_depth) ** 2).sum())
-        return total
+        return total + (0.0 if speed is None else speed.cost(self.poses))
 
 
-def _add(equations: DenseEquations | SparseEquations, rhs: Array, blocks: Array, part_h: Array, part_b: Array) -> None:
-    """Add a part (6 k, 6 k) and (6 k,) of the system, of ``blocks`` (k,); -1 = fixed."""
-    moves = blocks >= 0
-    keep = np.repeat(moves, 6)
-    equations.add(blocks[moves], part_h[np.ix_(keep, keep)])
-    np.add.at(rhs, unknowns(blocks[moves]), part_b[keep])
-
-
-def _facing_scene(end: _Estimate, anchors: list[int], still: int) -> tuple[dict[int, Array], dict[int, Array]]:
+def _facing_scene(end: _Estimate, anchors: list[int], still: int) -> tuple[Array, dict[int, Array]]:
     """Poses and depths; where most points ended behind their cameras, inverse depths and translations are negated,
-    all of them: they project the same."""
+    all of them: they project the same. ``still``: row of the pose that stays."""
     if np.median(np.concatenate([end.depths[i] for i in anchors])) >= 0:
         return end.poses, end.depths
-    still_from_world = end.poses[still]
-    world_from_still = inverse(still_from_world)
-    poses = {}
-    for k, cam_from_world in end.poses.items():
-        pose = cam_from_world @ world_from_still
-        pose[:3, 3] *= -1
-        poses[k] = pose @ still_from_world
-    return poses, {**end.depths, **{i: -end.depths[i] for i in anchors}}
+    poses = end.poses @ inverse(end.poses[still])
+    poses[:, :3, 3] *= -1
+    return poses @ end.poses[still], {**end.depths, **{i: -end.depths[i] for i in anchors}}
 
 
 def _typical(inv_depth: Array) -> float:

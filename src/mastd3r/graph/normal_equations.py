@@ -13,21 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array
 
+from ..geometry.pose_kernels import add_part
+
 Array = NDArray[Any]
 BLOCK = 6
 DENSE_MOST = 300  # blocks, above: sparse. Below, Cholesky of the whole is faster.
 
 
 class DenseEquations:
-    """H (n, n)."""
+    """H (n, n) and b (n,)."""
 
     def __init__(self, blocks: int) -> None:
-        self._hess = np.zeros((BLOCK * blocks, BLOCK * blocks))
+        self._hess, self.rhs = np.zeros((BLOCK * blocks, BLOCK * blocks)), np.zeros(BLOCK * blocks)
 
-    def add(self, blocks: Array, part: Array) -> None:
-        """Add ``part`` (6 k, 6 k), whose rows and columns are those of ``blocks`` (k,)."""
-        rows = unknowns(blocks)
-        np.add.at(self._hess, (rows[:, None], rows[None, :]), part)
+    def add(self, blocks: Array, part_h: Array, part_b: Array) -> None:
+        """Add parts (6 k, 6 k) and (6 k,), whose rows and columns are those of ``blocks`` (k,); -1: left out."""
+        add_part(self._hess, self.rhs, blocks, part_h, part_b)
 
     def matrix(self) -> Array:
         """H as it is now."""
@@ -52,25 +53,20 @@ class BlockPattern:
 
 
 class SparseEquations:
-    """The same H, of which only the blocks of a pattern are held."""
+    """The same H, of which only the blocks of a pattern are held, and b."""
 
     def __init__(self, pattern: BlockPattern) -> None:
         self._pattern = pattern
-        self._data = np.zeros((len(pattern.keys), BLOCK, BLOCK))
+        self._data, self.rhs = np.zeros((len(pattern.keys), BLOCK, BLOCK)), np.zeros(BLOCK * pattern.blocks)
 
-    def add(self, blocks: Array, part: Array) -> None:
+    def add(self, blocks: Array, part_h: Array, part_b: Array) -> None:
         """See ``DenseEquations.add``; the blocks are within a group of the pattern."""
-        k = len(blocks)
-        parts = part.reshape(k, BLOCK, k, BLOCK).transpose(0, 2, 1, 3)
-        np.add.at(self._data, self._pattern.slots(blocks), parts)
+        k, moves = len(blocks), blocks >= 0
+        parts = part_h.reshape(k, BLOCK, k, BLOCK).transpose(0, 2, 1, 3)
+        np.add.at(self._data, self._pattern.slots(blocks[moves]), parts[np.ix_(moves, moves)])
+        np.add.at(self.rhs.reshape(-1, BLOCK), blocks[moves], part_b.reshape(k, BLOCK)[moves])
 
     def matrix(self) -> Any:
         """H as it is now, a scipy.sparse array."""
         size = BLOCK * self._pattern.blocks
         return bsr_array((self._data, self._pattern.indices, self._pattern.indptr), shape=(size, size)).tocsc()
-
-
-def unknowns(blocks: Array) -> Array:
-    """(6 k,) rows of the unknowns of ``blocks`` (k,)."""
-    rows: Array = (BLOCK * blocks[:, None] + np.arange(BLOCK)).reshape(-1)
-    return rows

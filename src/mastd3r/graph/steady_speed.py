@@ -7,7 +7,7 @@ and all that they see twice as far away, and no match says otherwise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ class SteadySpeed:
     unit of length, so that it pulls at no scale as a whole, and is never longer than 1.
     """
 
-    ids: Array  # (n, 3) keyframes
+    ids: Array  # (n, 3) keyframes, or rows of their poses
     gaps_s: Array  # (n, 2) between them
     weight: Array  # (n,) px²
 
@@ -39,19 +39,23 @@ class SteadySpeed:
         ids, gaps_s = ids[known], gaps_s[known]
         return cls(ids, gaps_s, weight / np.maximum(gaps_s.max(axis=1, initial=0) / GOES_ON_S, 1) ** 2)
 
-    def cost(self, poses: Mapping[int, Array]) -> float:
-        """Sum of w r² under cam_from_world (4, 4) of the keyframes."""
+    def by_rows(self, row_of: Mapping[int, int]) -> SteadySpeed:
+        """The same of poses that stand in an array, by the row of each keyframe."""
+        return replace(self, ids=np.array([[row_of[k] for k in some] for some in self.ids.tolist()], int))
+
+    def cost(self, poses: Array) -> float:
+        """Sum of w r² under cam_from_world (q, 4, 4)."""
         if not len(self.ids):
             return 0.0
-        r, *_ = self._residuals(self._poses(poses))
+        r, *_ = self._residuals(poses[self.ids])
         return float(self.weight @ (r**2).sum(axis=1))
 
-    def system(self, poses: Mapping[int, Array]) -> tuple[Array, Array]:
+    def system(self, poses: Array) -> tuple[Array, Array]:
         """(n, 18, 18) JᵀwJ and (n, 18) -Jᵀwr, by the left perturbations (rho, phi) of the three poses.
 
         A centre c = -Rᵀ t moves by -Rᵀ rho.
         """
-        pose = self._poses(poses)
+        pose = poses[self.ids]
         r, velocity, speed, total = self._residuals(pose)
         away = r[:, None, :, None] * (velocity / np.maximum(speed, STILL)[..., None])[:, :, None, :]
         by_velocity = (np.array([-1.0, 1.0])[:, None, None] * np.eye(3) - away) / total[:, None, None, None]
@@ -62,9 +66,6 @@ class SteadySpeed:
             jacobian[:, :, 6 * n : 6 * n + 3] = -by_centre[:, n] @ pose[:, n, :3, :3].transpose(0, 2, 1)
         weighted = self.weight[:, None, None] * jacobian.transpose(0, 2, 1)
         return weighted @ jacobian, -(weighted @ r[..., None])[..., 0]
-
-    def _poses(self, poses: Mapping[int, Array]) -> Array:
-        return np.stack([np.stack([poses[int(k)] for k in row]) for row in self.ids])
 
     def _residuals(self, pose: Array) -> tuple[Array, Array, Array, Array]:
         """(n, 3) r, (n, 2, 3) velocities, (n, 2) speeds, (n,) their sum, from (n, 3, 4, 4) cam_from_world."""
