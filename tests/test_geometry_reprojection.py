@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mastd3r.geometry.anchor_matches import AnchorMatches
 from mastd3r.geometry.least_squares import damped_solve
 from mastd3r.geometry.reprojection_kernels import (
     MIN_DEPTH,
     N_COLS,
-    AnchorMatches,
     anchor_cost,
     anchor_system,
     edge_residuals,

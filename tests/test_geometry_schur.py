@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mastd3r.geometry.reprojection_kernels import N_COLS, AnchorMatches, anchor_system
+from mastd3r.geometry.anchor_matches import AnchorMatches
+from mastd3r.geometry.reprojection_kernels import N_COLS, anchor_system
 from mastd3r.geometry.schur_kernels import (
     anchor_part,
     anchor_part_cost,
@@ -109,7 +110,7 @@ def test_an_anchor_keyframe_s_part_is_made_of_what_its_edges_say(seed: int) -> N
     poses, ends = np.stack([se3_exp(rng.normal(scale=0.1, size=6)) for _ in range(m + 2)]), rng.permutation(m + 2)[:-1]
     j_from_i = np.stack([poses[k] @ inverse(poses[ends[0]]) for k in ends[1:]])
     to_anchor = -np.stack([adjoint(t) for t in j_from_i])
-    h, b, cross, depth_info, bd, cost = anchor_system(px, depth, a.matches, j_from_i, g, 5.0)
+    h, b, cross, depth_info, bd, cost = anchor_system(px, depth, a.matches, j_from_i, g, 5.0, a.blocks[-1] >= 0)
     hdd, bd = depth_info + prior[1] + 1e-9, bd + prior[1] * (prior[0] - depth)
     hess, rhs = local_system(h, b, to_anchor)
     eliminate(hess, rhs, cross, a.matches, to_anchor, a.blocks, hdd, bd)

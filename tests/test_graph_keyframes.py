@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mastd3r.camera.pinhole import Camera
 from mastd3r.config import CameraConfig, GraphConfig
-from mastd3r.geometry.reprojection_kernels import AnchorMatches, anchor_cost
+from mastd3r.geometry.anchor_matches import AnchorMatches
+from mastd3r.geometry.reprojection_kernels import anchor_cost
 from mastd3r.geometry.se3 import inverse, se3_exp
 from mastd3r.graph.covisibility import covisible, nearest_keyframe, overlap
 from mastd3r.graph.depth import carried, depth_confidence, inpainted, upsampled

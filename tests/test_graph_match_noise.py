@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from mastd3r.graph import match_noise
+from mastd3r.graph.few_points import thinned
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.match_noise import learn_match_variance, match_variance_px2, squared_residuals
-from mastd3r.graph.passages import thinned
 from mastd3r.graph.solved_anew import solve_anew
 from mastd3r.graph.windows import everything, in_a_row
 from test_graph_keyframes import graph_of

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import inverse, se3_exp, so3_log
 from mastd3r.graph import passages as passages_module
+from mastd3r.graph.few_points import chain_of_few, solved, thinned
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.passages import (
     LENGTH,
@@ -24,8 +25,6 @@ from mastd3r.graph.passages import (
     kept_if_cheaper,
     replace_passage,
     retake_passages,
-    solved,
-    thinned,
 )
 from test_graph_keyframes import graph_of
 
@@ -154,7 +153,7 @@ def test_a_passage_is_tried_again_once_it_has_more_matches_or_another_cost(monke
 
     monkeypatch.setattr(passages_module, "doubtful_passages", doubtful)
     monkeypatch.setattr(passages_module, "cost_alone", lambda *_: costs[-1])
-    monkeypatch.setattr(passages_module, "_retake", lambda _, ids, __: bool(retaken.append(ids)))
+    monkeypatch.setattr(passages_module, "_retake", lambda _, ids, *__: bool(retaken.append(ids)))
     tried = Tried()
     for edges, cost, count in (((1, 2), 100, 1), ((1, 2), 101, 1), ((1, 2, 3), 101, 2), ((1, 2, 3), 90, 3)):
         graph.edges = edges
@@ -168,7 +167,7 @@ def test_where_one_was_taken_the_others_are_looked_at_once_more(monkeypatch: pyt
     cost = {3: 100.0, 8: 80.0, 20: 120.0}
     retaken = list[int]()
 
-    def retake(_: Any, ids: list[int], __: float) -> bool:
+    def retake(_: Any, ids: list[int], *__: Any) -> bool:
         retaken.append(ids[0])
         if retaken.count(3) != 1 or ids[0] != 3:
             return False
@@ -187,13 +186,15 @@ def test_of_several_explanations_the_cheapest_is_taken(
 ) -> None:
     """Not the first that is better than the one there is."""
     costs, states = iter([90.0, 50.0]), iter(["the first", "the second"])  # after either start
-    taken = list[Any]()
+    taken, graph = list[Any](), chain(exact_scene)
     monkeypatch.setattr(passages_module, "STARTS", (lambda _: True, lambda _: True))
     monkeypatch.setattr(passages_module, "solved", lambda *_: next(costs))
-    monkeypatch.setattr(passages_module, "state_of", lambda _: next(states))
-    monkeypatch.setattr(passages_module, "replace_passage", lambda _, __, state: taken.append(state))
-    monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda _, __, change: (change() is None, 1.0, 1.0))
-    assert passages_module._retake(chain(exact_scene), list(range(14, VIEWS)), 100.0) and taken == ["the second"]
+    depths = {k: v.inv_depth for k, v in graph.variables.items()}
+    monkeypatch.setattr(passages_module, "state_of", lambda _: {14: (next(states), depths[14])})
+    monkeypatch.setattr(passages_module, "_costs_of_few", lambda *_: (100.0, 50.0))
+    monkeypatch.setattr(passages_module, "replace_passage", lambda _, __, state: taken.append(state[14][0]))
+    monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda _, __, change, ___: (change() is None, 1.0, 1.0))
+    assert passages_module._retake(graph, list(range(14, VIEWS)), 100.0, {}) and taken == ["the second"]
 
 
 def test_what_there_is_is_not_judged_by_a_wide_solve_that_ends_in_a_worse_place(
@@ -228,3 +229,58 @@ def test_one_wrong_link_between_two_right_halves_is_found(exact_scene: Callable[
         found = part.variables[k + 1].cam_from_world @ inverse(part.variables[k].cam_from_world)
         true = truth[k + 1] @ inverse(truth[k])
         assert np.degrees(np.linalg.norm(so3_log(found[:3, :3] @ true[:3, :3].T))) < 1.0
+
+
+@pytest.mark.parametrize("is_long", [False, True])
+def test_a_few_points_refuse_what_all_would_and_all_are_asked_before_it_is_taken(
+    exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, is_long: bool
+) -> None:
+    """An explanation whose passage by itself costs as little, and to which the rest does not fit."""
+    if is_long:
+        monkeypatch.setattr(passages_module, "LONG", VIEWS - 1)
+        monkeypatch.setattr(passages_module, "AROUND", 3)
+    graph, ids = chain(exact_scene), list(range(8, 18))
+    as_it_is = {k: graph.variables[k].cam_from_world.copy() for k in graph.members()}
+    right = {k: (graph.variables[k].cam_from_world, graph.variables[k].inv_depth) for k in ids}
+    far = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
+    wrong = {k: (far @ pose if k > 12 else pose, depth) for k, (pose, depth) in right.items()}
+    settled = passages_module.Settled()
+    before, after = passages_module._costs_of_few(graph, ids, right, settled)
+    assert after == pytest.approx(before, rel=0.02)
+    again, astray = passages_module._costs_of_few(graph, ids, wrong, settled)
+    assert again == before and astray > 1.2 * before and len(settled) == 1
+    for k, pose in as_it_is.items():
+        np.testing.assert_array_equal(graph.variables[k].cam_from_world, pose)
+    asked = list[bool]()
+    monkeypatch.setattr(passages_module, "STARTS", (lambda _: True,))
+    monkeypatch.setattr(passages_module, "solved", lambda *_: 1.0)
+    monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda *_: asked.append(True) or (False, 1.0, 2.0))
+    for costs, count in (((10.0, 11.0), 0), ((10.0, 9.0), 1)):
+        monkeypatch.setattr(passages_module, "_costs_of_few", lambda *_, c=costs: c)
+        assert not passages_module._retake(graph, ids, 100.0, settled) and len(asked) == count
+
+
+def test_what_was_put_in_and_refused_leaves_no_trace(exact_scene: Callable[..., Any]) -> None:
+    """Not in the priors of what came along at another scale either."""
+    graph, ids = chain(exact_scene), list(range(8, 18))
+    kept = {k: (v.prior_depth.copy(), v.prior_info.copy()) for k, v in graph.variables.items()}
+    now = {k: graph.variables[k] for k in ids}
+    state = {k: (v.cam_from_world, v.inv_depth * (0.5 if k > 12 else 1.0)) for k, v in now.items()}
+    scaled = replace_passage(graph, ids, state)
+    assert scaled.times == pytest.approx(0.5) and scaled.ids == list(range(18, VIEWS))
+    assert not np.allclose(graph.variables[18].prior_info, kept[18][1])
+    scaled.undo(graph)
+    for k, (prior_depth, prior_info) in kept.items():
+        np.testing.assert_allclose(graph.variables[k].prior_depth, prior_depth)
+        np.testing.assert_allclose(graph.variables[k].prior_info, prior_info)
+
+
+def test_a_speed_that_goes_on_weighs_as_much_beside_a_few_points_as_beside_all(
+    exact_scene: Callable[..., Any],
+) -> None:
+    graph = chain(exact_scene)
+    points = len(graph.variables[0].px)
+    part = chain_of_few(graph, graph.free_members(), 150)
+    assert 150 <= len(part.variables[0].px) < points
+    share = len(part.variables[0].px) / points
+    assert part.config.steady_speed == pytest.approx(share * graph.config.steady_speed)

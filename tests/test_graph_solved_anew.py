@@ -12,9 +12,9 @@ import pytest
 from mastd3r.geometry.se3 import inverse, se3_exp, transform
 from mastd3r.graph import passages
 from mastd3r.graph import solved_anew as module
+from mastd3r.graph.few_points import state_of
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.passages import state_of
-from mastd3r.graph.solved_anew import POINTS, solve_anew
+from mastd3r.graph.solved_anew import solve_anew
 from test_graph_passages import VIEWS, off_deg
 from test_graph_passages import chain as true_chain
 
@@ -88,14 +88,3 @@ def test_it_is_not_for_every_chain(exact_scene: Callable[..., Any], monkeypatch:
     if why in ("short", "long"):
         monkeypatch.setattr(module, {"short": "LEAST", "long": "LONG"}[why], {"short": VIEWS + 1, "long": 3}[why])
     assert not solve_anew(graph)
-
-
-def test_a_speed_that_goes_on_weighs_as_much_beside_a_few_points_as_beside_all(
-    exact_scene: Callable[..., Any],
-) -> None:
-    graph = true_chain(exact_scene)
-    points = len(graph.variables[0].px)
-    part = module._thinned(graph, graph.free_members())
-    assert POINTS <= len(part.variables[0].px) < points
-    share = len(part.variables[0].px) / points
-    assert part.config.steady_speed == pytest.approx(share * graph.config.steady_speed)

@@ -13,8 +13,9 @@ from mastd3r.config import Config, GraphConfig
 from mastd3r.geometry.se3 import se3_exp
 from mastd3r.geometry.sim3 import Sim3
 from mastd3r.graph import bundle_adjustment
+from mastd3r.graph.few_points import solved, thinned
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.passages import SETTLING, cost_around, solved, thinned
+from mastd3r.graph.passages import SETTLING, cost_around
 from mastd3r.graph.steady_speed import SteadySpeed
 from mastd3r.graph.windows import Window, everything, in_a_row, sliding
 from mastd3r.offline.final_solve import finish_graph

@@ -12,12 +12,13 @@ unknowns a pose perturbation of j (6), intrinsics g = (log f, k, cx, cy, m, n) (
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numba as nb
 import numpy as np
 from numpy.typing import NDArray
+
+from .anchor_matches import AnchorMatches
 
 Array = NDArray[Any]
 _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", "nogil": True}
@@ -140,9 +141,21 @@ def _lens_columns(
 
 @nb.njit(inline="always", **_JIT)
 def _edge_point(
-    px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, fold: tuple[float, float], jac: Array
+    px: float,
+    py: float,
+    d: float,
+    tx: float,
+    ty: float,
+    t: Array,
+    g: Array,
+    fold: tuple[float, float],
+    lens: bool,
+    jac: Array,
 ) -> tuple[float, float, float, float, float]:
-    """Residual (rx, ry), depth Jacobian (jd0, jd1) and Y_z; fills ``jac`` (2, 12) for [pose j, globals]."""
+    """Residual (rx, ry), depth Jacobian (jd0, jd1) and Y_z; fills ``jac`` (2, 12) for [pose j, globals].
+
+    Without ``lens`` the columns of the globals stay as they are.
+    """
     f = math.exp(g[0])
     k = g[1]
     m = g[4]
@@ -172,21 +185,22 @@ def _edge_point(
     w01 = -q * vx * vy
     w11 = 1.0 / sj - q * vy * vy
     _pose_columns(jac, f, fz, d, qx, qy)
-    _lens_columns(jac, f, fz, k, m, n, x, y, r2, vx, vy, s2, qx, qy, t)
+    if lens:
+        _lens_columns(jac, f, fz, k, m, n, x, y, r2, vx, vy, s2, qx, qy, t)
     jd0 = fz * (t[0, 3] - qx * t[2, 3])
     jd1 = fz * (t[1, 3] - qy * t[2, 3])
-    for i in range(N_COLS):
+    for i in range(N_COLS if lens else N_POSE):
         j0 = jac[0, i]
         jac[0, i] = w00 * j0 + w01 * jac[1, i]
         jac[1, i] = w01 * j0 + w11 * jac[1, i]
     j0 = jd0
     jd0 = w00 * j0 + w01 * jd1
     jd1 = w01 * j0 + w11 * jd1
-    # the prediction c + f v itself
-    jac[0, 6] += f * vx
-    jac[1, 6] += f * vy
-    jac[0, 8] += 1.0
-    jac[1, 9] += 1.0
+    if lens:  # the prediction c + f v itself
+        jac[0, 6] += f * vx
+        jac[1, 6] += f * vy
+        jac[0, 8] += 1.0
+        jac[1, 9] += 1.0
     return rx, ry, jd0, jd1, yz
 
 
@@ -211,83 +225,42 @@ def _edge_residual(
     return tx - g[2] - f * vx, ty - g[3] - f * vy, yz
 
 
-class AnchorMatches(NamedTuple):
-    """The matches with weight of one anchor keyframe, edge after edge: k in all of its m edges."""
-
-    first: Array  # (m + 1,) int64: those of edge e are first[e] to first[e + 1]
-    edge: Array  # (k,) int64
-    point: Array  # (k,) int64 of the anchor's p points, in order within an edge
-    target: Array  # (k, 2) float64 pixels in the edge's other end
-    weight: Array  # (k,) float64, above 0
-    of_point: Array  # (p + 1,) int64: those of point n are by_point[of_point[n]] to by_point[of_point[n + 1]]
-    by_point: Array  # (k,) int64 the matches, point after point, in order of their edges
-
-    @staticmethod
-    def of(targets: Sequence[Array], weights: Sequence[Array]) -> AnchorMatches:
-        """Of edges that say of all p points where they are, (p, 2) each, and with which weight, (p,) each."""
-        m, p = len(weights), len(weights[0])
-        first, edge, point = np.zeros(m + 1, np.int64), np.empty(m * p, np.int64), np.empty(m * p, np.int64)
-        target, weight = np.empty((m * p, 2)), np.empty(m * p)
-        for e in range(m):
-            first[e + 1] = _pack(targets[e], weights[e], e, first[e], edge, point, target, weight)
-        kept: tuple[Array, ...] = tuple(a[: first[m]].copy() for a in (edge, point, target, weight))
-        return AnchorMatches(first, *kept, *_sorted(kept[1], p))
-
-
-@nb.njit(**_JIT)
-def _pack(
-    targets: Array, weights: Array, e: int, at: int, edge: Array, point: Array, target: Array, weight: Array
-) -> int:
-    """Add the matches with weight of edge ``e`` from row ``at`` on; returns the row after them."""
-    for n in range(len(weights)):
-        if weights[n] > 0:
-            edge[at], point[at], weight[at] = e, n, weights[n]
-            target[at, 0], target[at, 1] = targets[n, 0], targets[n, 1]
-            at += 1
-    return at
-
-
-@nb.njit(**_JIT)
-def _sorted(point: Array, p: int) -> tuple[Array, Array]:
-    """``of_point`` and ``by_point`` of matches (k,) of p points."""
-    first, order = np.zeros(p + 1, np.int64), np.empty(len(point), np.int64)
-    for n in point:
-        first[n + 1] += 1
-    for n in range(p):
-        first[n + 1] += first[n]
-    at = first[:-1].copy()
-    for k in range(len(point)):
-        order[at[point[k]]] = k
-        at[point[k]] += 1
-    return first, order
-
-
 @nb.njit(**_JIT)
 def anchor_system(
-    px: Array, depth: Array, matches: AnchorMatches, j_from_i: Array, g: Array, kernel_px: float
+    px: Array, depth: Array, matches: AnchorMatches, j_from_i: Array, g: Array, kernel_px: float, lens: bool = True
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Normal-equation parts of all m edges of one anchor keyframe.
 
     Args: px (p, 2) pixels of it; depth (p,) inverse depths; matches (k of them); j_from_i (m, 4, 4);
-        g (6,) intrinsics; kernel_px scale of the Cauchy kernel.
+        g (6,) intrinsics; kernel_px scale of the Cauchy kernel; lens False: what belongs to g is left at 0.
     Returns: H (m, 12, 12), b (m, 12), E (k, 12) = w J^T J_d, H_dd (p,), b_d (p,), cost (m,).
     """
+    m, p = len(matches.first) - 1, px.shape[0]
+    hess, rhs = np.zeros((m, N_COLS, N_COLS)), np.zeros((m, N_COLS))
+    cross, cost = np.zeros((len(matches.point), N_COLS), np.float32), np.zeros(m)
+    hdd, bd = np.zeros(p), np.zeros(p)
+    if lens:
+        _sum_up(px, depth, matches, j_from_i, g, kernel_px, True, hess, rhs, cross, hdd, bd, cost)
+    else:
+        _sum_up(px, depth, matches, j_from_i, g, kernel_px, False, hess, rhs, cross, hdd, bd, cost)
+    return hess, rhs, cross, hdd, bd, cost
+
+
+@nb.njit(inline="always", **_JIT)
+def _sum_up(
+    px: Array, depth: Array, matches: AnchorMatches, j_from_i: Array, g: Array, kernel_px: float, lens: bool,
+    hess: Array, rhs: Array, cross: Array, hdd: Array, bd: Array, cost: Array,
+) -> None:  # fmt: skip
+    """``anchor_system`` into arrays of zeros; inlined, so that loops are made for either ``lens``."""
     first, point, target, weight = matches.first, matches.point, matches.target, matches.weight
-    m, p = len(first) - 1, px.shape[0]
     fold = fold_radius(g[1], g[4], g[5])
-    hess = np.zeros((m, N_COLS, N_COLS))
-    rhs = np.zeros((m, N_COLS))
-    cross = np.zeros((len(point), N_COLS), np.float32)
-    hdd = np.zeros(p)
-    bd = np.zeros(p)
-    cost = np.zeros(m)
     c2 = kernel_px * kernel_px
-    for e in range(m):
+    for e in range(len(first) - 1):
         jac = np.zeros((2, N_COLS))
         for s in range(first[e], first[e + 1]):
             w, n = weight[s], point[s]
             rx, ry, jd0, jd1, yz = _edge_point(
-                px[n, 0], px[n, 1], depth[n], target[s, 0], target[s, 1], j_from_i[e], g, fold, jac
+                px[n, 0], px[n, 1], depth[n], target[s, 0], target[s, 1], j_from_i[e], g, fold, lens, jac
             )
             if yz < MIN_DEPTH:
                 cost[e] += w * c2 * 4.0
@@ -297,17 +270,16 @@ def anchor_system(
             w = w / (1.0 + r2 / c2)
             hdd[n] += w * (jd0 * jd0 + jd1 * jd1)
             bd[n] += w * (jd0 * rx + jd1 * ry)
-            for i in range(N_COLS):
+            for i in range(N_COLS if lens else N_POSE):
                 wi0 = w * jac[0, i]
                 wi1 = w * jac[1, i]
                 rhs[e, i] += wi0 * rx + wi1 * ry
                 cross[s, i] = wi0 * jd0 + wi1 * jd1
-                for j in range(i, N_COLS):
+                for j in range(i, N_COLS if lens else N_POSE):
                     hess[e, i, j] += wi0 * jac[0, j] + wi1 * jac[1, j]
         for i in range(N_COLS):
             for j in range(i):
                 hess[e, i, j] = hess[e, j, i]
-    return hess, rhs, cross, hdd, bd, cost
 
 
 @nb.njit(**_JIT)
@@ -372,7 +344,9 @@ def pose_system(
         w = weight[n]
         if w <= 0.0:
             continue
-        rx, ry, a, b, yz = _edge_point(px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, fold, jac)
+        rx, ry, a, b, yz = _edge_point(
+            px[n, 0], px[n, 1], depth[n], target[n, 0], target[n, 1], j_from_i, g, fold, False, jac
+        )
         if yz < MIN_DEPTH:
             cost += w * c2 * 4.0
             continue

@@ -12,8 +12,9 @@ import numba as nb
 import numpy as np
 from numpy.typing import NDArray
 
+from .anchor_matches import AnchorMatches
 from .pose_kernels import edge_poses, to_anchor_pose
-from .reprojection_kernels import N_GLOBAL, N_POSE, AnchorMatches, anchor_cost, anchor_system
+from .reprojection_kernels import N_GLOBAL, N_POSE, anchor_cost, anchor_system
 
 Array = NDArray[Any]
 _JIT: dict[str, Any] = {"cache": True, "fastmath": True, "error_model": "numpy", "nogil": True}
@@ -185,7 +186,7 @@ def anchor_part(
     Returns: H (n, n), b (n,), E (k, 12), to_anchor (m, 6, 6), H_dd (p,), b_d (p,), H_dd without the prior (p,), cost.
     """
     j_from_i = edge_poses(poses, ends)
-    h, b, cross, depth_info, bd, cost = anchor_system(px, depth, matches, j_from_i, g, kernel_px)
+    h, b, cross, depth_info, bd, cost = anchor_system(px, depth, matches, j_from_i, g, kernel_px, blocks[-1] >= 0)
     hdd = depth_info + prior[1] + 1e-9
     bd += prior[1] * (prior[0] - depth)
     to_anchor = to_anchor_pose(j_from_i)

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..concurrency import give_back_memory, on_two_threads
+from ..geometry.anchor_matches import AnchorMatches
 from ..geometry.least_squares import Damping, damped_solve, levenberg_marquardt
 from ..geometry.pose_kernels import moved_poses
-from ..geometry.reprojection_kernels import N_GLOBAL, AnchorMatches
+from ..geometry.reprojection_kernels import N_GLOBAL
 from ..geometry.schur_kernels import anchor_part, anchor_part_cost, moved_depths
 from ..geometry.se3 import inverse
 from .factors import Factors, ReprojectionFactor, Variables

@@ -10,17 +10,17 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
-from .factors import KeyframeVariables, ReprojectionFactor, thinned_edge
+from .factors import ReprojectionFactor
+from .few_points import KERNEL_PX, State, at_all_points, chain_of_few, put_back, solved, state_of, thinned
 from .initialisation import attempt, errors_px, first_pairs, two_view_pose
-from .intrinsics import Intrinsics, as_given
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
 from .windows import ALL_INTRINSICS, Window
@@ -28,11 +28,9 @@ from .windows import ALL_INTRINSICS, Window
 Array = NDArray[Any]
 Start = Callable[[KeyframeGraph], bool]
 Tried = dict[tuple[int, int, int], float]  # cost of passages, by first and last keyframe and edges
-State = dict[int, tuple[Array, Array]]  # cam_from_world (4, 4) and inverse depths of keyframes
+Settled = dict[tuple[int, int], tuple[float, State]]  # the chain on a few points, by its first and last keyframe
 log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
-MOST_POINTS = 300  # of a keyframe, for a decision
-KERNEL_PX = 0.5
 LOOKED_AT = 1.1  # times the median passage's cost a weight: another explanation is looked for
 DOUBTFUL = 1.3  # the same: something is wrong there
 MOST_DOUBTED, MOST_LONG = 10, 3  # passages looked at in one round, the worst first, and longer ones
@@ -42,11 +40,12 @@ CHANGED = 0.02  # of the cost, from which a passage is tried again
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
 NEAR = ((KERNEL_PX, 8),)  # the same of the chain, before a passage is changed
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
+WHOLE_OF_FEW = (*WHOLE[:2], (KERNEL_PX, 10))  # the same, on a few points
+TOLERANCE = 1e-5  # relative, of either
 LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
 LINKS, PAIRS = 3, 2  # that fit worst, and pairs of views across one, that a passage is joined by in turn
 WIDE = ((4.0, 4),)  # kernel and iterations, after which they are compared
 MISFIT_PX = 3.0  # from where a match is wrong
-DEPTH_PRIOR = 1e-3  # information of a depth's prior, times its square: weak
 
 
 def retake_passages(graph: KeyframeGraph, tried: Tried | None = None) -> int:
@@ -58,12 +57,13 @@ def retake_passages(graph: KeyframeGraph, tried: Tried | None = None) -> int:
     """
     taken, tried = 0, Tried() if tried is None else tried
     for _ in range(ROUNDS):
+        settled = Settled()
         for ids in doubtful_passages(graph, LOOKED_AT):
             key, cost = (ids[0], ids[-1], len(graph.edges_among(ids))), cost_alone(graph, ids)
             if abs(tried.get(key, np.inf) - cost) <= CHANGED * cost:
                 continue
             tried[key] = cost
-            if _retake(graph, ids, cost):
+            if _retake(graph, ids, cost, settled):
                 taken += 1
                 break  # the passages beside it have changed
         else:
@@ -101,8 +101,11 @@ def cost_alone(graph: KeyframeGraph, ids: Sequence[int]) -> float:
     return solved(thinned(graph, ids), ((KERNEL_PX, 15),))
 
 
-def _retake(graph: KeyframeGraph, ids: Sequence[int], cost: float) -> bool:
-    """The best of the other explanations of one passage, if it is better than the one there is, of this ``cost``."""
+def _retake(graph: KeyframeGraph, ids: Sequence[int], cost: float, settled: Settled) -> bool:
+    """The best of the other explanations of one passage, if it is better than the one there is, of this ``cost``.
+
+    Where a few points of the whole chain speak against it all are not asked. ``settled``: what they cost as it is.
+    """
     best: tuple[float, State] | None = None
     for start in STARTS:
         part = thinned(graph, ids)
@@ -116,10 +119,16 @@ def _retake(graph: KeyframeGraph, ids: Sequence[int], cost: float) -> bool:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
     found, state = best
-    taken, before, after = kept_if_cheaper(graph, ids, lambda: replace_passage(graph, ids, state))
+    state = {k: (pose, at_all_points(graph.variables[k].px, depth)) for k, (pose, depth) in state.items()}
+    before, after = _costs_of_few(graph, ids, state, settled)
+    taken = after < before
     if taken:
-        log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f", *frames, cost, found, before,
-                 after)  # fmt: skip
+        scaled = list[Scaled]()
+        taken, before, after = kept_if_cheaper(
+            graph, ids, lambda: scaled.append(replace_passage(graph, ids, state)), lambda: scaled[0].undo(graph)
+        )
+    log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f, %s", *frames, cost, found, before,
+             after, "taken" if taken else "left")  # fmt: skip
     return taken
 
 
@@ -200,34 +209,7 @@ def _misfit(part: KeyframeGraph, edges: Sequence[ReprojectionFactor]) -> float:
 STARTS: tuple[Start, ...] = (_from_turn, _from_two_views, _from_worst_link)
 
 
-# -- a passage by itself -----------------------------------------------------------------------------------------
-
-
-def thinned(graph: KeyframeGraph, ids: Sequence[int], points: int = MOST_POINTS) -> KeyframeGraph:
-    """A graph of its own of some keyframes with some of their points; its lens is given."""
-    step = max(1, max(len(graph.variables[k].px) for k in ids) // points)
-    out = KeyframeGraph(graph.config, as_given(graph.intrinsics))
-    out.size, out.submap, out.match_variance_px2 = graph.size, graph.submap, graph.match_variance_px2
-    out.keyframes = [graph.keyframes[k] for k in ids]
-    out.submap_of = dict.fromkeys(ids, graph.submap)
-    for k in ids:
-        v = graph.variables[k]
-        inv_depth = v.inv_depth[::step]
-        info = np.full(len(inv_depth), DEPTH_PRIOR / float(np.median(v.inv_depth)) ** 2)
-        px = v.px[::step].copy()  # kernels are compiled for arrays without gaps
-        out.variables[k] = KeyframeVariables(px, inv_depth.copy(), inv_depth.copy(), info, v.cam_from_world)
-    out.edges = [thinned_edge(e, step) for e in graph.edges_among(ids)]
-    return out
-
-
-def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]]) -> float:
-    """The cost after steps of (kernel in pixels, iterations), the first keyframe held."""
-    cost, still = np.inf, frozenset([min(part.variables)])
-    for kernel_px, iterations in steps:
-        steady = kernel_px <= KERNEL_PX  # not of a start, where all may be at one place
-        window = Window(list(part.variables), part.edges, still, ALL_INTRINSICS, steady=steady)
-        cost = part.optimise(window, iterations, kernel_px).cost_last
-    return cost
+# -- the chain with another explanation of a passage ------------------------------------------------------------
 
 
 def cost_around(graph: KeyframeGraph, ids: Sequence[int], steps: Sequence[tuple[float, int]] = NEAR) -> float:
@@ -235,18 +217,40 @@ def cost_around(graph: KeyframeGraph, ids: Sequence[int], steps: Sequence[tuple[
 
     Those before stay where they are, those after come along.
     """
-    members = graph.members()
-    if len(members) <= LONG:
+    around, after = _around(graph, ids)
+    if around == graph.members():
         return [graph.solve_all(iterations, kernel_px, steady=True) for kernel_px, iterations in steps][-1].cost_last
-    first, last = members.index(ids[0]), members.index(ids[-1])
-    around = members[max(first - AROUND, 0) : last + AROUND + 1]
     still = frozenset([around[0], *(k for k in around if k < graph.held)])
     window = Window(around, graph.edges_among(around), still, ALL_INTRINSICS, steady=True)
     old_end = graph.variables[around[-1]].cam_from_world
-    cost = [graph.optimise(window, n, kernel_px, tolerance=1e-5) for kernel_px, n in steps][-1].cost_last
+    cost = [graph.optimise(window, n, kernel_px, tolerance=TOLERANCE) for kernel_px, n in steps][-1].cost_last
     moved = inverse(graph.variables[around[-1]].cam_from_world) @ old_end
-    graph.transform_keyframes(members[last + AROUND + 1 :], Sim3.from_rigid(moved))
+    graph.transform_keyframes(after, Sim3.from_rigid(moved))
     return cost
+
+
+def _around(graph: KeyframeGraph, ids: Sequence[int]) -> tuple[list[int], list[int]]:
+    """The keyframes that speak for a passage, and those after them; in a chain that is not ``LONG`` all."""
+    members = graph.members()
+    if len(members) <= LONG:
+        return members, []
+    first, last = members.index(ids[0]), members.index(ids[-1])
+    end = last + AROUND + 1
+    return members[max(first - AROUND, 0) : end], members[end:]
+
+
+def _costs_of_few(graph: KeyframeGraph, ids: Sequence[int], state: State, settled: Settled) -> tuple[float, float]:
+    """What a few points of the chain cost as it is, in the nearest minimum, and with a passage as ``state`` has it."""
+    around, _ = _around(graph, ids)
+    key, part = (around[0], around[-1]), chain_of_few(graph, around)
+    if key not in settled:
+        cost = solved(part, NEAR, graph.held, TOLERANCE)
+        settled[key] = cost, state_of(part)
+    before, as_it_is = settled[key]
+    put_back(part, as_it_is, part.intrinsics)
+    every = {k: -(-len(depth) // len(part.variables[k].px)) for k, (_, depth) in state.items()}
+    replace_passage(part, ids, {k: (pose, depth[:: every[k]]) for k, (pose, depth) in state.items()})
+    return before, solved(part, WHOLE_OF_FEW, graph.held, TOLERANCE)
 
 
 def kept_if_cheaper(
@@ -272,24 +276,23 @@ def kept_if_cheaper(
     return kept, before, after
 
 
-def state_of(graph: KeyframeGraph) -> State:
-    """Poses and inverse depths of all keyframes, as they are now."""
-    return {k: (v.cam_from_world.copy(), v.inv_depth.copy()) for k, v in graph.variables.items()}
-
-
-def put_back(graph: KeyframeGraph, state: State, lens: Intrinsics) -> None:
-    """Poses and inverse depths as ``state_of`` gave them, and the intrinsics of then."""
-    graph.set_intrinsics(lens)
-    for k, (pose, inv_depth) in state.items():
-        graph.set_keyframe_pose(k, pose)
-        graph.set_depths(k, inv_depth)
-
-
 # -- back into the chain -----------------------------------------------------------------------------------------
 
 
-def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> None:
-    """Poses and depths of a passage as ``state`` (of thinned points) has them; what follows goes with its end."""
+@dataclass(frozen=True)
+class Scaled:
+    """Keyframes whose lengths are ``times`` what they were."""
+
+    ids: list[int]
+    times: float
+
+    def undo(self, graph: KeyframeGraph) -> None:
+        """As they were, with the priors of their depths and the frames that hang on them."""
+        graph.scale_keyframes(self.ids, 1 / self.times)
+
+
+def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> Scaled:
+    """Poses and depths of a passage as ``state`` has them; what follows goes with its end. What has changed scale."""
     ratio = _length_ratio(graph, ids[:3], state)
     end = ids[-1]
     old_end = Sim3.from_rigid(graph.variables[end].cam_from_world)
@@ -300,26 +303,20 @@ def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> N
         from_first = pose @ inverse(first_new)
         from_first[:3, 3] /= ratio
         graph.set_keyframe_pose(k, from_first @ first_pose)
-        graph.set_depths(k, at_all_points(graph.variables[k].px, inv_depth * ratio))
+        graph.set_depths(k, inv_depth * ratio)
     # lengths of what follows: as its end's were, which have become ``1 / grown`` of what they were
     new_end = Sim3.from_rigid(inverse(graph.variables[end].cam_from_world))
     world_from_old = new_end @ Sim3(np.eye(3), np.zeros(3), 1 / grown) @ old_end
     after = [k for k in graph.members() if k > end]
     graph.transform_keyframes(after, world_from_old)
-
-
-def at_all_points(px: Array, thinned: Array) -> Array:
-    """(p,) values at ``px`` (p, 2) from those of every n-th of them: the nearest one's."""
-    step = -(-len(px) // len(thinned))
-    return thinned[cKDTree(px[::step]).query(px)[1]]
+    return Scaled(after, 1 / grown)
 
 
 def _length_ratio(graph: KeyframeGraph, ids: Sequence[int], state: State) -> float:
     """Inverse depths of some keyframes before / inverse depths in ``state``, the median."""
     ratios = []
     for k in ids:
-        new = state[k][1]
-        old = graph.variables[k].inv_depth[:: -(-len(graph.variables[k].inv_depth) // len(new))]
+        old, new = graph.variables[k].inv_depth, state[k][1]
         known = (old > 0) & (new > 0)
         ratios.append(float(np.median(old[known] / new[known])) if known.any() else 1.0)
     return float(np.median(ratios))

@@ -8,11 +8,10 @@ comes out of it. On a few points a solve from a wide kernel costs a fraction of 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import replace
 
+from .few_points import at_all_points, chain_of_few, solved, state_of
 from .keyframe_graph import KeyframeGraph
-from .passages import LONG, at_all_points, kept_if_cheaper, solved, state_of, thinned
+from .passages import LONG, kept_if_cheaper
 
 log = logging.getLogger(__name__)
 POINTS = 150  # of a keyframe
@@ -30,7 +29,7 @@ def solve_anew(graph: KeyframeGraph) -> bool:
     ids = graph.free_members()
     if graph.depths_measured or graph.held or not LEAST <= len(ids) <= LONG:
         return False
-    here, part = _thinned(graph, ids), _thinned(graph, ids)
+    here, part = chain_of_few(graph, ids, POINTS), chain_of_few(graph, ids, POINTS)
     here_cost = solved(here, SETTLING)
     alike, part.config = part.config, graph.config
     solved(part, COARSE_TO_FINE)
@@ -48,11 +47,3 @@ def solve_anew(graph: KeyframeGraph) -> bool:
     log.info("%d keyframes solved anew, coarse to fine: cost %.0f -> %.0f on a few points, %.0f -> %.0f on all, %s",
              len(ids), here_cost, there_cost, before, now, "taken" if taken else "left")  # fmt: skip
     return taken
-
-
-def _thinned(graph: KeyframeGraph, ids: Sequence[int]) -> KeyframeGraph:
-    """``thinned``, where a speed that goes on weighs as much beside the matches as on all points."""
-    part = thinned(graph, ids, POINTS)
-    share = sum(len(v.px) for v in part.variables.values()) / sum(len(graph.variables[k].px) for k in ids)
-    part.config = replace(part.config, steady_speed=share * graph.config.steady_speed)
-    return part
