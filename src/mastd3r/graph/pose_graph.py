@@ -12,12 +12,13 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.sparse.linalg import spsolve
 
+from ..geometry.least_squares import Damping, levenberg_marquardt
 from ..geometry.se3 import adjoint, inverse, se3_exp, se3_log
 from ..geometry.sim3 import Sim3
 from .keyframe_graph import KeyframeGraph
 
 Array = NDArray[Any]
-ITERATIONS = 15
+ITERATIONS = 30
 LOOP_WEIGHT = 100.0  # of a loop's matches against an edge's: what it says is verified, and many edges hold the chain
 
 
@@ -51,7 +52,7 @@ def optimise_pose_graph(graph: KeyframeGraph, loops: list[Loop]) -> None:
     A loop counts ``LOOP_WEIGHT`` times that. Edges side by side drift alike; were each one more measurement against a
     lone loop, they would keep a part of the drift, and no solver that starts from there takes it out again.
     Scale first, which is linear: minimise the sum of w (x_j - x_i - log s)², x the log of a keyframe's factor. Then the
-    poses, with the edges' translations stretched: Gauss-Newton on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
+    poses, with the edges' translations stretched: Levenberg-Marquardt on SE(3), r = log(T_j T_i⁻¹ measured⁻¹).
     """
     ids = graph.members()
     row = {k: n for n, k in enumerate(ids)}
@@ -105,8 +106,8 @@ def _log_factors(n: int, still: int, edges: list[_Edge]) -> Array:
 
 
 def _chained(first: Array, n: int, edges: list[_Edge]) -> list[Array]:
-    """Poses along the strongest edges, loops left out."""
-    steps = {(x.i, x.j): x for x in edges if not x.is_loop}
+    """Poses along the strongest edges, loops among them: what they do not agree on lies at the weakest."""
+    steps = {(x.i, x.j): x for x in edges}  # of a pair that is both, the loop
     cost = coo_array(([1 / max(x.weight, 1e-9) for x in steps.values()], tuple(np.array([*steps]).T)), shape=(n, n))
     order, before = breadth_first_order(minimum_spanning_tree(csr_array(cost)), 0, directed=False)
     poses = [first] * n
@@ -117,34 +118,56 @@ def _chained(first: Array, n: int, edges: list[_Edge]) -> list[Array]:
     return poses
 
 
+@dataclass(frozen=True)
+class _Poses:
+    """cam_from_world (4, 4) of all keyframes, the first ``still`` of which stay: values of Levenberg-Marquardt."""
+
+    poses: list[Array]
+    still: int
+    edges: list[_Edge]
+    unit: Array  # (6,) squares of what a residual is divided by
+
+    def _residuals(self) -> Array:
+        """(m, 6) log(T_j T_i⁻¹ measured⁻¹)."""
+        return np.stack([se3_log(self.poses[x.j] @ inverse(x.j_from_i @ self.poses[x.i])) for x in self.edges])
+
+    def _weights(self) -> Array:
+        weight = np.array([x.weight for x in self.edges])
+        return (weight / weight.mean())[:, None] * self.unit
+
+    def cost(self) -> float:
+        """Sum of w r²."""
+        return float((self._weights() * self._residuals() ** 2).sum())
+
+    def linearised(self) -> tuple[Any, Array, float]:
+        """See ``least_squares.Estimate``; the rows of what stays are empty."""
+        n, (first, second) = len(self.poses), (np.array([getattr(x, end) for x in self.edges]) for end in "ij")
+        weight, residual = self._weights(), self._residuals()
+        jac = np.zeros((len(self.edges), 2, 6, 6))
+        jac[:, 1] = np.eye(6)
+        for e, x in enumerate(self.edges):
+            jac[e, 0] = -adjoint(self.poses[x.j] @ inverse(self.poses[x.i]))
+        columns = 6 * np.stack([first, second], axis=1)[:, :, None] + np.arange(6)  # (m, 2, 6)
+        moves = columns >= 6 * self.still
+        rows = np.broadcast_to(6 * np.arange(len(self.edges))[:, None, None, None] + np.arange(6)[:, None], jac.shape)
+        at = np.broadcast_to(columns[:, :, None, :], jac.shape), np.broadcast_to(moves[:, :, None, :], jac.shape)
+        matrix = csr_array(coo_array((np.where(at[1], jac, 0.0).ravel(), (rows.ravel(), at[0].ravel())),
+                                     shape=(6 * len(self.edges), 6 * n)))  # fmt: skip
+        weighted = matrix.T @ diags_array(weight.ravel())
+        return weighted @ matrix, -(weighted @ residual.ravel()), float((weight * residual**2).sum())
+
+    def moved(self, step: Array) -> _Poses:
+        """Perturbed on the left."""
+        poses = [se3_exp(xi) @ p for xi, p in zip(step.reshape(-1, 6), self.poses, strict=True)]
+        return replace(self, poses=poses)
+
+
 def _solve_poses(poses: list[Array], still: int, edges: list[_Edge], depth: float) -> list[Array]:
-    """Gauss-Newton on the edges, the first ``still`` poses held.
+    """What the edges say together, the first ``still`` poses held.
 
     A translation of the scene's depth counts like a turn of one radian.
     """
-    n, first = len(poses), 6 * still
-    if still == n:
+    if still == len(poses):
         return poses
-    unit = np.r_[np.full(3, 1 / depth), np.ones(3)] ** 2
-    mean = np.mean([x.weight for x in edges])
-    for _ in range(ITERATIONS):
-        rows, cols, values, rhs = [], [], [], np.zeros(6 * n)
-        for x in edges:
-            found = poses[x.j] @ inverse(poses[x.i])
-            residual, jac_i = se3_log(found @ inverse(x.j_from_i)), -adjoint(found)
-            w = unit * x.weight / mean
-            parts = ((x.i, jac_i), (x.j, np.eye(6)))
-            for a, jac_a in parts:
-                rhs[6 * a : 6 * a + 6] -= jac_a.T @ (w * residual)
-                for b, jac_b in parts:
-                    r, c = np.meshgrid(np.arange(6 * a, 6 * a + 6), np.arange(6 * b, 6 * b + 6), indexing="ij")
-                    rows.append(r.ravel())
-                    cols.append(c.ravel())
-                    values.append((jac_a.T @ (w[:, None] * jac_b)).ravel())
-        hess = coo_array((np.concatenate(values), (np.concatenate(rows), np.concatenate(cols))), shape=(6 * n, 6 * n))
-        inner = csr_array(hess)[first:, first:] + 1e-9 * diags_array(np.ones(6 * n - first))
-        step = np.r_[np.zeros(first), spsolve(inner.tocsc(), rhs[first:])]
-        poses = [se3_exp(step[6 * k : 6 * k + 6]) @ p for k, p in enumerate(poses)]
-        if np.abs(step).max() < 1e-7:
-            break
-    return poses
+    start = _Poses(poses, still, edges, np.r_[np.full(3, 1 / depth), np.ones(3)] ** 2)
+    return levenberg_marquardt(start, Damping(tries=6), iterations=ITERATIONS, tolerance=1e-9).estimate.poses

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from ..graph.loose import loose_parts
 from ..graph.passages import doubtful_passages, retake_passages
 from ..graph.place_recognition import PlaceRecognition
 from ..graph.pose_graph import Loop, optimise_pose_graph
-from ..graph.submaps import with_scale, world_from_seen
+from ..graph.submaps import with_scale
 from ..types import USABLE_WEIGHT
 from .places import most_alike, not_unlike
 from .two_view import TwoView, TwoViewEstimator
@@ -55,6 +55,15 @@ class _Seen:
     back: TwoView
     drift: float  # rad by which it would turn what was tracked
     gap_ratio: float  # by which it would move one end against the other / way between them
+    inv_depths: tuple[float, float]  # the median ones of its ends, in whose lengths the loop is
+
+    def now(self, graph: KeyframeGraph) -> _Seen:
+        """The same in the lengths that there are around its ends now, with what it asks for under these poses."""
+        ends = self.loop.i, self.loop.j
+        by_i, by_j = (was / graph.median_inv_depth(k) for was, k in zip(self.inv_depths, ends, strict=True))
+        there = self.loop.j_from_i.in_lengths(by_j)
+        loop = replace(self.loop, j_from_i=Sim3(there.rotation, there.translation, there.scale / by_i))
+        return _under_poses(graph, loop, self.there, self.back)
 
 
 def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceRecognition) -> list[Loop]:
@@ -86,12 +95,13 @@ def close_loops(two_view: TwoViewEstimator, graph: KeyframeGraph, places: PlaceR
     if len(graph.keyframes) >= MANY:
         getattr(two_view.parts.features, "forget", lambda: None)()
         give_back_memory()
-    _put_loose_parts(graph, voted)
+    _say_one_place(graph, found)
     _close(graph, found)
     if voted:  # the ends of what was badly explained have moved far
         retake_passages(graph)
-        doubted = [_under_poses(graph, seen.loop, seen.there, seen.back) for seen in doubted if seen not in voted]
+        doubted = [seen.now(graph) for seen in doubted if seen not in voted]
         late = [seen for seen in doubted if _credible(seen)]
+        _say_one_place(graph, late)
         _close(graph, late)
         found, doubted = found + late, [seen for seen in doubted if seen not in late]
     for seen in doubted:
@@ -105,17 +115,6 @@ def _close(graph: KeyframeGraph, found: list[_Seen]) -> None:
     if found:
         optimise_pose_graph(graph, [seen.loop for seen in found])
         graph.solve_all(10, 2.0, steady=True)
-
-
-def _put_loose_parts(graph: KeyframeGraph, voted: list[_Seen]) -> None:
-    """A part that next to nothing holds goes where loops put it, as it is: the drift lies at its link."""
-    for part in loose_parts(graph) if voted else []:
-        inside = set(part)
-        loop = next((s.loop for s in voted if (s.loop.i in inside) != (s.loop.j in inside)), None)
-        if loop is None:
-            continue
-        put = world_from_seen(graph, loop.i, loop.j, loop.j_from_i)
-        graph.transform_keyframes(part, put if loop.j in inside else put.inverse())
 
 
 class _Chain:
@@ -160,11 +159,6 @@ def _credible(seen: _Seen) -> bool:
 
 def _connect(graph: KeyframeGraph, seen: _Seen) -> None:
     i, j, there, back = seen.loop.i, seen.loop.j, seen.there.pair.matches, seen.back.pair.matches
-    _say(
-        graph,
-        seen.loop,
-        f"one place, scale {1 / seen.loop.j_from_i.scale:.3f}, {_drift(seen)}",
-    )
     graph.connect(i, j, there, static_at(graph.keyframes[j].moving / 255.0, there.new_px))
     graph.connect(j, i, back, static_at(graph.keyframes[i].moving / 255.0, back.new_px))
 
@@ -187,6 +181,11 @@ def _voted_for(graph: KeyframeGraph, doubted: list[_Seen]) -> list[_Seen]:
         best = max(best, agree, key=len)
     ends = {s.loop.i for s in best}, {s.loop.j for s in best}
     return best if min(map(len, ends)) >= VOTES else []
+
+
+def _say_one_place(graph: KeyframeGraph, found: list[_Seen]) -> None:
+    for seen in found:
+        _say(graph, seen.loop, f"one place, scale {1 / seen.loop.j_from_i.scale:.3f}, {_drift(seen)}")
 
 
 def _say(graph: KeyframeGraph, loop: Loop, verdict: str) -> None:
@@ -270,7 +269,8 @@ def _under_poses(graph: KeyframeGraph, loop: Loop, there: TwoView, back: TwoView
     tracked = graph.variables[loop.j].cam_from_world @ inverse(graph.variables[loop.i].cam_from_world)
     drift = float(np.linalg.norm(so3_log(loop.j_from_i.rotation @ tracked[:3, :3].T)))
     gap = float(np.linalg.norm(loop.j_from_i.translation - tracked[:3, 3]))
-    return _Seen(loop, there, back, drift, gap / max(_way(graph, loop.i, loop.j), 1e-12))
+    inv_depths = graph.median_inv_depth(loop.i), graph.median_inv_depth(loop.j)
+    return _Seen(loop, there, back, drift, gap / max(_way(graph, loop.i, loop.j), 1e-12), inv_depths)
 
 
 def _way(graph: KeyframeGraph, i: int, j: int) -> float:
