@@ -126,6 +126,17 @@ def test_all_columns_and_the_depth_agree_with_finite_differences(seed: int) -> N
 
 @QUICK
 @given(seeds)
+def test_without_the_lens_its_columns_stay_empty_and_all_else_is_the_same(seed: int) -> None:
+    s = Edges(seed)
+    for whole, part in zip(anchor_system(*s.args(), WIDE_PX), anchor_system(*s.args(), WIDE_PX, False), strict=True):
+        own = np.zeros_like(whole)
+        pose = (slice(None), *(slice(6) for _ in range(whole.ndim - 1)))
+        own[pose] = whole[pose]
+        np.testing.assert_allclose(part, own, rtol=1e-6, atol=1e-9 * np.abs(whole).max())
+
+
+@QUICK
+@given(seeds)
 def test_each_column_by_itself(seed: int) -> None:
     """One match at a time: H determines its two-row Jacobian up to a rotation, and b and E fix that."""
     s = Edges(seed, edges=1, points=1)

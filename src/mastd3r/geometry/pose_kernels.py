@@ -1,4 +1,4 @@
-"""Numba kernels of the joint optimisation: the poses of an anchor keyframe's edges, and poses moved by a step.
+"""Numba kernels of the joint optimisation: poses of edges, poses moved by a step, parts added to the system.
 
 What ``se3`` does for one pose, for all of them in one call.
 """

@@ -141,18 +141,17 @@ class _Poses:
 
     def linearised(self) -> tuple[Any, Array, float]:
         """See ``least_squares.Estimate``; the rows of what stays are empty."""
-        n, (first, second) = len(self.poses), (np.array([getattr(x, end) for x in self.edges]) for end in "ij")
+        n, m = len(self.poses), len(self.edges)
         weight, residual = self._weights(), self._residuals()
-        jac = np.zeros((len(self.edges), 2, 6, 6))
-        jac[:, 1] = np.eye(6)
+        jac = np.zeros((m, 2, 6, 6))  # by the poses of either end
         for e, x in enumerate(self.edges):
             jac[e, 0] = -adjoint(self.poses[x.j] @ inverse(self.poses[x.i]))
-        columns = 6 * np.stack([first, second], axis=1)[:, :, None] + np.arange(6)  # (m, 2, 6)
-        moves = columns >= 6 * self.still
-        rows = np.broadcast_to(6 * np.arange(len(self.edges))[:, None, None, None] + np.arange(6)[:, None], jac.shape)
-        at = np.broadcast_to(columns[:, :, None, :], jac.shape), np.broadcast_to(moves[:, :, None, :], jac.shape)
-        matrix = csr_array(coo_array((np.where(at[1], jac, 0.0).ravel(), (rows.ravel(), at[0].ravel())),
-                                     shape=(6 * len(self.edges), 6 * n)))  # fmt: skip
+        jac[:, 1] = np.eye(6)
+        ends = np.array([(x.i, x.j) for x in self.edges])
+        jac[ends < self.still] = 0.0
+        rows = np.broadcast_to(6 * np.arange(m)[:, None, None, None] + np.arange(6)[:, None], jac.shape)
+        columns = np.broadcast_to(6 * ends[:, :, None, None] + np.arange(6), jac.shape)
+        matrix = csr_array(coo_array((jac.ravel(), (rows.ravel(), columns.ravel())), shape=(6 * m, 6 * n)))
         weighted = matrix.T @ diags_array(weight.ravel())
         return weighted @ matrix, -(weighted @ residual.ravel()), float((weight * residual**2).sum())
 
