@@ -141,17 +141,9 @@ def _lens_columns(
 
 @nb.njit(inline="always", **_JIT)
 def _edge_point(
-    px: float,
-    py: float,
-    d: float,
-    tx: float,
-    ty: float,
-    t: Array,
-    g: Array,
-    fold: tuple[float, float],
-    lens: bool,
+    px: float, py: float, d: float, tx: float, ty: float, t: Array, g: Array, fold: tuple[float, float], lens: bool,
     jac: Array,
-) -> tuple[float, float, float, float, float]:
+) -> tuple[float, float, float, float, float]:  # fmt: skip
     """Residual (rx, ry), depth Jacobian (jd0, jd1) and Y_z; fills ``jac`` (2, 12) for [pose j, globals].
 
     Without ``lens`` the columns of the globals stay as they are.
