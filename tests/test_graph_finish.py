@@ -289,3 +289,23 @@ def test_a_frame_beside_something_that_moves_takes_the_minimum_that_fits_most(
         one_way = solve_pose(matches, one_way, kernel_px=kernel_px).new_from_ref
     error, error_one_way = (float(np.linalg.norm((p - truth)[:3, 3])) for p in (found, one_way))
     assert error < 0.005 < error_one_way and error < 0.3 * error_one_way
+
+
+@pytest.mark.parametrize("to", [20.0, 500.0])
+def test_a_pose_that_no_camera_can_have_come_to_is_lost(exact_scene: Callable[..., Any], to: float) -> None:
+    """Two frames out and back: 20 depths is far, 500 is where nothing that is matched can put them."""
+    scene = exact_scene(13)
+    graph = tracked_graph(scene, lost=set())
+    depth = 1 / float(np.median([graph.median_inv_depth(k) for k in graph.variables]))
+    frames = final_frames(graph)
+    for n in (7, 8):
+        pose = frames[n].world_from_cam.copy()
+        pose[:3, 3] += [0.0, to * depth, 0.1 * n]
+        frames[n] = replace(frames[n], world_from_cam=pose)
+    out = final_solve._without_leaps(graph, frames)
+    assert [n for n, f in enumerate(out) if f.state == "lost"] == ([7, 8] if to > 100 else [])
+    tail = [
+        replace(f, world_from_cam=f.world_from_cam + np.pad([[9e3 * depth]] * 3, ((0, 1), (3, 0)))) for f in frames[9:]
+    ]
+    both = final_solve._without_leaps(graph, [*out[:9], *tail])
+    assert {n for n, f in enumerate(both) if f.state == "lost"} >= {9, 10, 11, 12}

@@ -33,6 +33,7 @@ from ..types import State, Trajectory
 Array = NDArray[Any]
 COARSE = ((4.0, 0.15), (1.0, 0.5))  # kernel in pixels before the last, and its share of the iterations
 MOST_FIT_PX, CLEARLY = 0.3, 0.8  # kernel by which two minima are told apart, and the share of the cost that is less
+LEAP_DEPTHS = 30.0  # typical depths of what is seen, that a camera does not go between two frames
 log = logging.getLogger(__name__)
 
 
@@ -122,7 +123,7 @@ def _solve(graph: KeyframeGraph, config: Config) -> SolveReport:
 def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
     """Every frame's pose from its kept matches and the final depths; lost ones between tracked ones interpolated.
 
-    A frame whose matches hardly agree with the pose that they give is a lost one, too.
+    A frame whose matches hardly agree with the pose that they give is a lost one, too, and one that is nowhere near.
     """
     passages = [list(some) for _, some in itertools.groupby(graph.records, lambda r: r.kf_id)]
     out: list[FinalFrame] = []
@@ -134,7 +135,7 @@ def final_frames(graph: KeyframeGraph) -> list[FinalFrame]:
             graph.set_record_pose(record, cam_from_kf)
             cam_from_world = cam_from_kf @ graph.variables[record.kf_id].cam_from_world
             out.append(FinalFrame(record, inverse(cam_from_world), record.state))
-    return _bridged(_without_unsupported(graph, out))
+    return _bridged(_without_leaps(graph, _without_unsupported(graph, out)))
 
 
 def _refined_all(graph: KeyframeGraph, records: list[FrameRecord]) -> list[Array | None]:
@@ -163,6 +164,30 @@ def _without_unsupported(graph: KeyframeGraph, frames: list[FinalFrame]) -> list
     for n in (n for n, weight in agreeing.items() if weight < least):
         log.info("frame %d: next to nothing agrees with its pose, it is lost", out[n].record.index)
         out[n] = replace(out[n], state="lost")
+    return out
+
+
+def _without_leaps(graph: KeyframeGraph, frames: list[FinalFrame]) -> list[FinalFrame]:
+    """Frames as lost that lie ``LEAP_DEPTHS`` from those around them: no match tells of such a step.
+
+    Of parts between which the camera leaps the one with most frames stays, and what is near that in time and place.
+    """
+    placed = np.array([n for n, f in enumerate(frames) if f.state != "lost"])
+    if len(placed) < 2:
+        return frames
+    most = LEAP_DEPTHS / max(float(np.median([graph.median_inv_depth(k) for k in graph.variables])), 1e-12)
+    place = np.array([frames[n].world_from_cam[:3, 3] for n in placed])
+    part = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1) > most)])
+    rest = np.flatnonzero(part == np.argmax(np.bincount(part)))
+    out = list(frames)
+    for n in set(part.tolist()) - {int(part[rest[0]])}:
+        inside = np.flatnonzero(part == n)
+        beside = rest[np.argmin(np.abs(rest - inside.mean()))]
+        if np.linalg.norm(place[inside] - place[beside], axis=1).min() > most:
+            ends = [frames[placed[k]].record.index for k in (inside[0], inside[-1])]
+            log.info("frames %d to %d: farther away than a camera can have come, they are lost", *ends)
+            for k in placed[inside]:
+                out[k] = replace(out[k], state="lost")
     return out
 
 
