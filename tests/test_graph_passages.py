@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,13 +12,15 @@ from numpy.typing import NDArray
 
 from mastd3r.geometry.se3 import inverse, se3_exp, so3_log
 from mastd3r.graph import passages as passages_module
-from mastd3r.graph.few_points import chain_of_few, solved, thinned
+from mastd3r.graph.few_points import State, chain_of_few, solved, thinned
 from mastd3r.graph.keyframe_graph import KeyframeGraph
 from mastd3r.graph.passages import (
     LENGTH,
     SETTLING,
     STARTS,
     WHOLE,
+    OnFew,
+    Settled,
     Start,
     Tried,
     cost_around,
@@ -181,20 +184,41 @@ def test_where_one_was_taken_the_others_are_looked_at_once_more(monkeypatch: pyt
     assert retaken == [20, 8, 3, 8, 3]
 
 
-def test_of_several_explanations_the_cheapest_is_taken(
+def test_of_several_explanations_that_is_taken_with_which_the_whole_costs_least(
     exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not the first that is better than the one there is."""
-    costs, states = iter([90.0, 50.0]), iter(["the first", "the second"])  # after either start
-    taken, graph = list[Any](), chain(exact_scene)
-    monkeypatch.setattr(passages_module, "STARTS", (lambda _: True, lambda _: True))
-    monkeypatch.setattr(passages_module, "solved", lambda *_: next(costs))
-    depths = {k: v.inv_depth for k, v in graph.variables.items()}
-    monkeypatch.setattr(passages_module, "state_of", lambda _: {14: (next(states), depths[14])})
-    monkeypatch.setattr(passages_module, "_costs_of_few", lambda *_: (100.0, 50.0))
-    monkeypatch.setattr(passages_module, "replace_passage", lambda _, __, state: taken.append(state[14][0]))
-    monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda _, __, change, ___: (change() is None, 1.0, 1.0))
-    assert passages_module._retake(graph, list(range(14, VIEWS)), 100.0, {}) and taken == ["the second"]
+    """Not the first that is better than the one there is, nor the one with which the passage alone costs least."""
+    ids, graph = list(range(14, VIEWS)), chain(exact_scene)
+    ends = iter([90.0, 50.0, 50.1, 60.0, 99.0])  # what a passage costs alone after each start; the third is the second
+    poses = {cost: se3_exp(np.full(6, 1e-3 * cost)) for cost in (50.0, 60.0)}
+    whole = {50.0: 11.0, 60.0: 9.0}
+    monkeypatch.setattr(passages_module, "STARTS", (lambda _: True,) * 5)
+    last = list[float]()
+
+    def solved_once(*_: Any) -> float:
+        last.append(next(ends))
+        return last[-1]
+
+    def state(_: Any) -> State:
+        return {k: (poses.get(last[-1], np.eye(4)), graph.variables[k].inv_depth) for k in ids}
+
+    def on_few(_: Any, __: Any, explanation: State, ___: Any) -> OnFew:
+        cost = next(c for c, pose in poses.items() if pose is explanation[14][0])
+        return OnFew(10.0, whole[cost], explanation, False, {})
+
+    taken = list[Any]()
+    monkeypatch.setattr(passages_module, "solved", solved_once)
+    monkeypatch.setattr(passages_module, "state_of", state)
+    monkeypatch.setattr(passages_module, "_on_few", on_few)
+    monkeypatch.setattr(passages_module, "_as_on_few", lambda *_: None)
+    monkeypatch.setattr(
+        passages_module, "replace_passage", lambda _, __, state, follows: taken.append((state, follows))
+    )
+    monkeypatch.setattr(
+        passages_module, "kept_if_cheaper", lambda _, __, change, *___, **____: (change() is None, 1.0, 1.0)
+    )
+    assert passages_module._retake(graph, ids, 95.0, Settled())
+    assert len(taken) == 1 and taken[0][0][14][0] is poses[60.0] and taken[0][1] is False
 
 
 def test_what_there_is_is_not_judged_by_a_wide_solve_that_ends_in_a_worse_place(
@@ -217,14 +241,17 @@ def test_what_there_is_is_not_judged_by_a_wide_solve_that_ends_in_a_worse_place(
 
 
 @pytest.mark.parametrize("turn_rad", [0.2, 0.5])
-def test_one_wrong_link_between_two_right_halves_is_found(exact_scene: Callable[..., Any], turn_rad: float) -> None:
+@pytest.mark.parametrize("end", [0, -1])
+def test_one_wrong_link_between_two_right_halves_is_found(
+    exact_scene: Callable[..., Any], turn_rad: float, end: int
+) -> None:
     """Wherever the halves were put: not by what was seen across, whose depths have adapted to it."""
     graph = chain(exact_scene)
     truth = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
     for k in range(BROKEN, VIEWS):  # on the left: cameras of the second half turn about the world's origin
         graph.set_keyframe_pose(k, truth[k] @ se3_exp(np.array([0.1, 0.3, -0.2, 0.0, turn_rad, 0.1])))
     part = thinned(graph, range(14, VIEWS))
-    assert passages_module._from_worst_link(part)
+    assert passages_module._from_one_end(part, end)
     for k in range(14, VIEWS - 1):
         found = part.variables[k + 1].cam_from_world @ inverse(part.variables[k].cam_from_world)
         true = truth[k + 1] @ inverse(truth[k])
@@ -235,29 +262,73 @@ def test_one_wrong_link_between_two_right_halves_is_found(exact_scene: Callable[
 def test_a_few_points_refuse_what_all_would_and_all_are_asked_before_it_is_taken(
     exact_scene: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, is_long: bool
 ) -> None:
-    """An explanation whose passage by itself costs as little, and to which the rest does not fit."""
+    """Another explanation, from which the solver does not come back."""
     if is_long:
         monkeypatch.setattr(passages_module, "LONG", VIEWS - 1)
         monkeypatch.setattr(passages_module, "AROUND", 3)
-    graph, ids = chain(exact_scene), list(range(8, 18))
+    graph, astray, ids = chain(exact_scene), chain(exact_scene), list(range(14, VIEWS))
+    break_up(astray)  # into a minimum of its own
     as_it_is = {k: graph.variables[k].cam_from_world.copy() for k in graph.members()}
-    right = {k: (graph.variables[k].cam_from_world, graph.variables[k].inv_depth) for k in ids}
-    far = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0]))
-    wrong = {k: (far @ pose if k > 12 else pose, depth) for k, (pose, depth) in right.items()}
-    settled = passages_module.Settled()
-    before, after = passages_module._costs_of_few(graph, ids, right, settled)
-    assert after == pytest.approx(before, rel=0.02)
-    again, astray = passages_module._costs_of_few(graph, ids, wrong, settled)
-    assert again == before and astray > 1.2 * before and len(settled) == 1
+    right, wrong = (
+        {k: (g.variables[k].cam_from_world, g.variables[k].inv_depth) for k in ids} for g in (graph, astray)
+    )
+    settled = Settled()
+    as_good = passages_module._on_few(graph, ids, right, settled)
+    assert as_good.after == pytest.approx(as_good.before, rel=0.02)
+    worse = passages_module._on_few(graph, ids, wrong, settled)
+    assert worse.before == as_good.before and worse.after > 1.2 * worse.before and len(settled.few) == 1
     for k, pose in as_it_is.items():
         np.testing.assert_array_equal(graph.variables[k].cam_from_world, pose)
-    asked = list[bool]()
-    monkeypatch.setattr(passages_module, "STARTS", (lambda _: True,))
-    monkeypatch.setattr(passages_module, "solved", lambda *_: 1.0)
-    monkeypatch.setattr(passages_module, "kept_if_cheaper", lambda *_: asked.append(True) or (False, 1.0, 2.0))
-    for costs, count in (((10.0, 11.0), 0), ((10.0, 9.0), 1)):
-        monkeypatch.setattr(passages_module, "_costs_of_few", lambda *_, c=costs: c)
-        assert not passages_module._retake(graph, ids, 100.0, settled) and len(asked) == count
+    asked = list[float | None]()
+
+    def refused(*given: Any) -> tuple[bool, float, float]:
+        asked.append(given[4])
+        return False, 1.0, 2.0
+
+    monkeypatch.setattr(passages_module, "_explanations", lambda *_: [(1.0, right)])
+    monkeypatch.setattr(passages_module, "kept_if_cheaper", refused)
+    for dearer, costs in ((1.001, []), (0.999, [None]), (0.99, [None, 1.0])):  # what it costs as it is is known by then
+        way = replace(as_good, after=dearer * as_good.before)
+        monkeypatch.setattr(passages_module, "_on_few", lambda *_, way=way: way)
+        assert not passages_module._retake(graph, ids, 100.0, settled) and asked == costs
+
+
+def test_what_follows_stays_where_other_views_hold_it(exact_scene: Callable[..., Any]) -> None:
+    """A passage that alone is astray, between two that are right: its end says nothing of where the rest is."""
+    graph, ids = chain(exact_scene), list(range(8, 18))
+    right = {k: (graph.variables[k].cam_from_world.copy(), graph.variables[k].inv_depth.copy()) for k in ids}
+    truth = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
+    turned_away = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
+    for k in ids:  # as a whole: the first of it stays where it was, the last is put elsewhere
+        graph.set_keyframe_pose(k, truth[k] @ inverse(truth[ids[0]]) @ turned_away @ truth[ids[0]])
+    way = passages_module._on_few(graph, ids, right, Settled())
+    assert not way.follows and way.after < 0.5 * way.before
+    scaled = replace_passage(graph, ids, right, way.follows)
+    assert scaled.ids == [] and scaled.times == 1.0
+    for k in range(ids[-1] + 1, VIEWS):
+        np.testing.assert_array_equal(graph.variables[k].cam_from_world, truth[k])
+    passages_module._as_on_few(graph, way.state)
+    for k in range(VIEWS - 1):
+        found = graph.variables[k + 1].cam_from_world @ inverse(graph.variables[k].cam_from_world)
+        true = truth[k + 1] @ inverse(truth[k])
+        assert np.degrees(np.linalg.norm(so3_log(found[:3, :3] @ true[:3, :3].T))) < 0.3
+
+
+def test_all_points_start_from_where_a_few_came_to(exact_scene: Callable[..., Any]) -> None:
+    """Also those of which a few know nothing: as much nearer or farther as the nearest of the few."""
+    graph, ids = chain(exact_scene), list(range(8, 18))
+    part = chain_of_few(graph, ids, 150)
+    state = {k: (v.cam_from_world, 2.0 * v.inv_depth) for k, v in part.variables.items()}
+    depth = {k: graph.variables[k].inv_depth.copy() for k in graph.members()}
+    away = se3_exp(np.array([0.1, 0.0, 0.0, 0.0, 0.1, 0.0]))
+    state[ids[-1]] = (away @ state[ids[-1]][0], state[ids[-1]][1])
+    old = {k: graph.variables[k].cam_from_world.copy() for k in graph.members()}
+    passages_module._as_on_few(graph, state)
+    for k in graph.members():
+        np.testing.assert_allclose(graph.variables[k].inv_depth, (2.0 if k in ids else 1.0) * depth[k])
+    np.testing.assert_allclose(graph.variables[ids[-1]].cam_from_world, away @ old[ids[-1]])
+    last = graph.variables[VIEWS - 1].cam_from_world @ inverse(graph.variables[ids[-1]].cam_from_world)
+    np.testing.assert_allclose(last, old[VIEWS - 1] @ inverse(old[ids[-1]]), atol=1e-9)  # what follows came along
 
 
 def test_what_was_put_in_and_refused_leaves_no_trace(exact_scene: Callable[..., Any]) -> None:

@@ -50,11 +50,21 @@ def chain_of_few(graph: KeyframeGraph, ids: Sequence[int], points: int = MOST_PO
     return part
 
 
-def solved(part: KeyframeGraph, steps: Sequence[tuple[float, int]], held: int = 0, tolerance: float = 1e-4) -> float:
-    """The cost after steps of (kernel in pixels, iterations); the first keyframe stays, and those before ``held``."""
+def solved(
+    part: KeyframeGraph,
+    steps: Sequence[tuple[float, int]],
+    held: int = 0,
+    tolerance: float = 1e-4,
+    widest_steady_px: float = KERNEL_PX,
+) -> float:
+    """The cost after steps of (kernel in pixels, iterations); the first keyframe stays, and those before ``held``.
+
+    ``widest_steady_px``: kernel up to which a speed that goes on is the likelier; not of a start, where all may be at
+    one place.
+    """
     cost, still = np.inf, frozenset([min(part.variables), *(k for k in part.variables if k < held)])
     for kernel_px, iterations in steps:
-        steady = kernel_px <= KERNEL_PX  # not of a start, where all may be at one place
+        steady = kernel_px <= widest_steady_px
         window = Window(list(part.variables), part.edges, still, ALL_INTRINSICS, steady=steady)
         cost = part.optimise(window, iterations, kernel_px, tolerance).cost_last
     return cost

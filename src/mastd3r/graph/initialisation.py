@@ -197,7 +197,9 @@ def _agreement(graph: KeyframeGraph) -> float:
     return close / max(sum(int(u.sum()) for u in used), 1)
 
 
-def first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[ReprojectionFactor]:
+def first_pairs(
+    graph: KeyframeGraph, turns: set[tuple[int, int]], count: int = FIRST_PAIRS
+) -> list[ReprojectionFactor]:
     """Pairs to start from: many matches and much image motion, best first; ``turns`` say nothing of depth."""
 
     def merit(edge: ReprojectionFactor) -> float:
@@ -206,7 +208,7 @@ def first_pairs(graph: KeyframeGraph, turns: set[tuple[int, int]]) -> list[Repro
         return float(used.sum() * min(np.median(moved) / (0.05 * max(graph.size)), 1.5))
 
     forward = [e for e in graph.edges if e.i < e.j and (e.i, e.j) not in turns]
-    return sorted(forward, key=merit, reverse=True)[:FIRST_PAIRS]
+    return sorted(forward, key=merit, reverse=True)[:count]
 
 
 def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
@@ -217,8 +219,16 @@ def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
         return None
     pose[:3, 3] *= 0.1
     graph.set_keyframe_pose(pair.j, pose)
-    done = [pair.i, pair.j]
-    _solve_part(graph, done, frozenset([pair.i]), 15, 2.0)
+    first = [pair.i, pair.j]
+    _solve_part(graph, first, frozenset([pair.i]), 15, 2.0)
+    add_one_by_one(graph, first)
+    cost = _solve_all(graph, graph.edges, 25)
+    return cost if np.isfinite(cost) else None
+
+
+def add_one_by_one(graph: KeyframeGraph, first: Sequence[int]) -> None:
+    """Poses and depths of the other keyframes from those of ``first``, the nearest first; ``first[0]`` stays."""
+    done = list(first)
     while len(done) < len(graph.keyframes):
         k = min((k for k in graph.variables if k not in done), key=lambda k: min(abs(k - d) for d in done))
         nearest = min(done, key=lambda d: abs(k - d))
@@ -227,9 +237,7 @@ def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
         done.append(k)
         _solve_part(graph, done, frozenset(done[:-1]), 15, 4.0)
         _carry(graph, nearest, k)
-        _solve_part(graph, done, frozenset([pair.i]), 6, 2.0)
-    cost = _solve_all(graph, graph.edges, 25)
-    return cost if np.isfinite(cost) else None
+        _solve_part(graph, done, frozenset([done[0]]), 6, 2.0)
 
 
 def _solve_all(graph: KeyframeGraph, edges: list[ReprojectionFactor], iterations: int) -> float:

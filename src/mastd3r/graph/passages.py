@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,9 +19,8 @@ from numpy.typing import NDArray
 
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
-from .factors import ReprojectionFactor
 from .few_points import KERNEL_PX, State, at_all_points, chain_of_few, put_back, solved, state_of, thinned
-from .initialisation import attempt, errors_px, first_pairs, two_view_pose
+from .initialisation import add_one_by_one, attempt, first_pairs
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
 from .windows import ALL_INTRINSICS, Window
@@ -28,7 +28,7 @@ from .windows import ALL_INTRINSICS, Window
 Array = NDArray[Any]
 Start = Callable[[KeyframeGraph], bool]
 Tried = dict[tuple[int, int, int], float]  # cost of passages, by first and last keyframe and edges
-Settled = dict[tuple[int, int], tuple[float, State]]  # the chain on a few points, by its first and last keyframe
+Ends = tuple[int, int]  # first and last keyframe of a chain
 log = logging.getLogger(__name__)
 LENGTH, STRIDE = 10, 5  # keyframes of a passage, and between the beginnings of two
 LOOKED_AT = 1.1  # times the median passage's cost a weight: another explanation is looked for
@@ -36,16 +36,25 @@ DOUBTFUL = 1.3  # the same: something is wrong there
 MOST_DOUBTED, MOST_LONG = 10, 3  # passages looked at in one round, the worst first, and longer ones
 ROUNDS = 6
 BETTER = 0.98  # of the cost, for another explanation to be taken
+SAME, EXPLANATIONS = 0.01, 2  # of the cost, by which two are told apart; of a passage, that the chain is asked about
 CHANGED = 0.02  # of the cost, from which a passage is tried again
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
-NEAR = ((KERNEL_PX, 8),)  # the same of the chain, before a passage is changed
+NEAR, NEAR_OF_FEW = ((KERNEL_PX, 8),), ((KERNEL_PX, 24),)  # the same of the chain, before a passage is changed
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
 WHOLE_OF_FEW = (*WHOLE[:2], (KERNEL_PX, 10))  # the same, on a few points
+SETTLED = ((1.0, 4), (KERNEL_PX, 6))  # and on all, from where a few points came to
 TOLERANCE = 1e-5  # relative, of either
+FEW = 150  # points of a keyframe of the chain
 LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
-LINKS, PAIRS = 3, 2  # that fit worst, and pairs of views across one, that a passage is joined by in turn
-WIDE = ((4.0, 4),)  # kernel and iterations, after which they are compared
-MISFIT_PX = 3.0  # from where a match is wrong
+PAIRS = (0, 2, 4)  # that a passage is begun from, of the best: the next best is often the same place again
+
+
+@dataclass
+class Settled:
+    """What chains cost as they are, in the nearest minimum, until something is taken."""
+
+    few: dict[Ends, tuple[float, State]] = field(default_factory=dict)  # on a few points, and what they come to
+    every: dict[Ends, float] = field(default_factory=dict)  # on all points, that are there by now
 
 
 def retake_passages(graph: KeyframeGraph, tried: Tried | None = None) -> int:
@@ -104,32 +113,49 @@ def cost_alone(graph: KeyframeGraph, ids: Sequence[int]) -> float:
 def _retake(graph: KeyframeGraph, ids: Sequence[int], cost: float, settled: Settled) -> bool:
     """The best of the other explanations of one passage, if it is better than the one there is, of this ``cost``.
 
-    Where a few points of the whole chain speak against it all are not asked. ``settled``: what they cost as it is.
+    The best is the one with which the whole chain costs least, on a few points; where those speak against it all are
+    not asked. ``settled``: what they cost as it is.
     """
-    best: tuple[float, State] | None = None
-    for start in STARTS:
-        part = thinned(graph, ids)
-        if not start(part):
-            continue
-        found = solved(part, SETTLING)
-        if found < (BETTER * cost if best is None else best[0]):
-            best = found, state_of(part)
     frames = [graph.keyframes[k].work.index for k in (ids[0], ids[-1])]
-    if best is None:
+    ways = [(found, _on_few(graph, ids, state, settled)) for found, state in _explanations(graph, ids, BETTER * cost)]
+    if not ways:
         log.info("frames %d to %d: no better explanation than the one there is", *frames)
         return False
-    found, state = best
-    state = {k: (pose, at_all_points(graph.variables[k].px, depth)) for k, (pose, depth) in state.items()}
-    before, after = _costs_of_few(graph, ids, state, settled)
-    taken = after < before
+    found, way = min(ways, key=lambda way: way[1].after)
+    before, after, taken = way.before, way.after, way.after < way.before
     if taken:
-        scaled = list[Scaled]()
-        taken, before, after = kept_if_cheaper(
-            graph, ids, lambda: scaled.append(replace_passage(graph, ids, state)), lambda: scaled[0].undo(graph)
-        )
+        around, _ = _around(graph, ids)
+        ends, scaled = (around[0], around[-1]), list[Scaled]()
+
+        def change() -> None:
+            scaled.append(replace_passage(graph, ids, way.explanation, way.follows))
+            _as_on_few(graph, way.state)
+
+        known = settled.every.get(ends)
+        taken, before, after = kept_if_cheaper(graph, ids, change, lambda: scaled[0].undo(graph), known, SETTLED)
+        settled.every[ends] = before
     log.info("frames %d to %d explained anew: cost %.0f -> %.0f, of all %.0f -> %.0f, %s", *frames, cost, found, before,
              after, "taken" if taken else "left")  # fmt: skip
     return taken
+
+
+def _explanations(graph: KeyframeGraph, ids: Sequence[int], bound: float) -> list[tuple[float, State]]:
+    """Some of what the starts come to that costs less than ``bound``, the cheapest first, on all points.
+
+    Which of two that cost a passage about as little is the true one, the passage does not know.
+    """
+    found = list[tuple[float, State]]()
+    for start in STARTS:
+        part = thinned(graph, ids)
+        if start(part):
+            cost = solved(part, SETTLING)
+            if cost < bound and all(abs(cost - other) > SAME * other for other, _ in found):
+                found.append((cost, state_of(part)))
+    px = {k: graph.variables[k].px for k in ids}
+    return [
+        (cost, {k: (pose, at_all_points(px[k], depth)) for k, (pose, depth) in state.items()})
+        for cost, state in sorted(found, key=lambda one: one[0])[:EXPLANATIONS]
+    ]
 
 
 # -- starts ------------------------------------------------------------------------------------------------------
@@ -146,67 +172,26 @@ def _from_turn(part: KeyframeGraph) -> bool:
     return True
 
 
-def _from_two_views(part: KeyframeGraph) -> bool:
-    """Two keyframes by their essential matrix, the others one after another."""
-    pairs = first_pairs(part, set())
-    return bool(pairs) and attempt(part, pairs[0]) is not None
+def _from_two_views(part: KeyframeGraph, nth: int) -> bool:
+    """Two keyframes by their essential matrix, the others one after another; the ``nth`` best pair to begin with."""
+    pairs = first_pairs(part, set(), nth + 1)
+    return nth < len(pairs) and attempt(part, pairs[nth]) is not None
 
 
-def _from_worst_link(part: KeyframeGraph) -> bool:
-    """Two halves as they are, joined anew where the matches across fit worst, by the essential matrix of two views.
+def _from_one_end(part: KeyframeGraph, end: int) -> bool:
+    """The first (0) or the last (-1) keyframe as it is, the others one after another from there.
 
-    Depths are those that the poses give: what was seen across a wrong link has adapted to it. A step is as long as
-    steps are in the passage. Of some links and pairs, that is taken which fits best once a wide kernel has seen it.
+    Tracking came from one side, and from depths that nothing had confirmed yet.
     """
-    ids = sorted(part.variables)
-    links = {n: _across(part, ids[:n]) for n in range(1, len(ids))}
-    misfits = {n: _misfit(part, edges) for n, edges in links.items() if edges}
-    poses = {k: part.variables[k].cam_from_world for k in ids}
-    centres = np.array([inverse(poses[k])[:3, 3] for k in ids])
-    step = float(np.median(np.linalg.norm(np.diff(centres, axis=0), axis=1)))
-    best: tuple[float, State] | None = None
-    for n in sorted(misfits, key=lambda n: -misfits[n])[:LINKS]:
-        for e in sorted(links[n], key=lambda e: -float(e.weight.sum()))[:PAIRS]:
-            pose = two_view_pose(part, e)
-            if pose is None:
-                continue
-            pose[:3, 3] *= step * abs(ids.index(e.j) - ids.index(e.i))
-            later, other = (e.j, pose @ poses[e.i]) if e.j >= ids[n] else (e.i, inverse(pose) @ poses[e.j])
-            for k in ids:
-                part.set_keyframe_pose(k, poses[k] @ inverse(poses[later]) @ other if k >= ids[n] else poses[k])
-            _depths_anew(part)
-            cost = solved(part, WIDE)
-            if best is None or cost < best[0]:
-                best = cost, state_of(part)
-    if best is None:
-        return False
-    put_back(part, best[1], part.intrinsics)
+    add_one_by_one(part, [sorted(part.variables)[end]])
     return True
 
 
-def _across(part: KeyframeGraph, before: Sequence[int]) -> list[ReprojectionFactor]:
-    """Edges between the keyframes ``before`` and the others."""
-    first = set(before)
-    return [e for e in part.edges if (e.i in first) != (e.j in first)]
-
-
-def _depths_anew(part: KeyframeGraph) -> None:
-    """Depths by the poses that there are, from one for all points of a keyframe."""
-    for k, v in part.variables.items():
-        part.set_depths(k, np.full(len(v.px), float(np.median(v.inv_depth))))
-        part.solve_depths(k)
-
-
-def _misfit(part: KeyframeGraph, edges: Sequence[ReprojectionFactor]) -> float:
-    """Share of the edges' weight that does not fit: w min(r² / MISFIT_PX², 1)."""
-    out = total = 0.0
-    for e, r in zip(edges, errors_px(part, edges), strict=True):
-        out += float((e.weight * np.minimum((r / MISFIT_PX) ** 2, 1.0)).sum())
-        total += float(e.weight.sum())
-    return out / max(total, 1e-9)
-
-
-STARTS: tuple[Start, ...] = (_from_turn, _from_two_views, _from_worst_link)
+STARTS: tuple[Start, ...] = (
+    _from_turn,
+    *(partial(_from_two_views, nth=n) for n in PAIRS),
+    *(partial(_from_one_end, end=end) for end in (0, -1)),
+)
 
 
 # -- the chain with another explanation of a passage ------------------------------------------------------------
@@ -239,18 +224,53 @@ def _around(graph: KeyframeGraph, ids: Sequence[int]) -> tuple[list[int], list[i
     return members[max(first - AROUND, 0) : end], members[end:]
 
 
-def _costs_of_few(graph: KeyframeGraph, ids: Sequence[int], state: State, settled: Settled) -> tuple[float, float]:
-    """What a few points of the chain cost as it is, in the nearest minimum, and with a passage as ``state`` has it."""
+@dataclass(frozen=True)
+class OnFew:
+    """What a few points of the chain cost as it is, and with another explanation of a passage; what that comes to."""
+
+    before: float
+    after: float
+    explanation: State  # of the passage, on all points
+    follows: bool  # what follows goes with the passage's end; else it stays where it is
+    state: State  # of the chain
+
+
+def _on_few(graph: KeyframeGraph, ids: Sequence[int], explanation: State, settled: Settled) -> OnFew:
+    """A few points of the chain as it is, in the nearest minimum, and with a passage as another explanation has it.
+
+    What follows goes with the passage's end, or stays where it is, as costs less: other views may hold it there.
+    """
     around, _ = _around(graph, ids)
-    key, part = (around[0], around[-1]), chain_of_few(graph, around)
-    if key not in settled:
-        cost = solved(part, NEAR, graph.held, TOLERANCE)
-        settled[key] = cost, state_of(part)
-    before, as_it_is = settled[key]
-    put_back(part, as_it_is, part.intrinsics)
-    every = {k: -(-len(depth) // len(part.variables[k].px)) for k, (_, depth) in state.items()}
-    replace_passage(part, ids, {k: (pose, depth[:: every[k]]) for k, (pose, depth) in state.items()})
-    return before, solved(part, WHOLE_OF_FEW, graph.held, TOLERANCE)
+    ends, part = (around[0], around[-1]), chain_of_few(graph, around, FEW)
+    if ends not in settled.few:
+        cost = solved(part, NEAR_OF_FEW, graph.held, TOLERANCE)
+        settled.few[ends] = cost, state_of(part)
+    before, as_it_is = settled.few[ends]
+    every = {k: -(-len(depth) // len(part.variables[k].px)) for k, (_, depth) in explanation.items()}
+    of_few = {k: (pose, depth[:: every[k]]) for k, (pose, depth) in explanation.items()}
+    ways = list[OnFew]()
+    for follows in (True, False) if ids[-1] < around[-1] else (True,):
+        put_back(part, as_it_is, part.intrinsics)
+        scaled = replace_passage(part, ids, of_few, follows)
+        cost = solved(part, WHOLE_OF_FEW, graph.held, TOLERANCE, widest_steady_px=WHOLE_OF_FEW[0][0])
+        ways.append(OnFew(before, cost, explanation, follows, state_of(part)))
+        scaled.undo(part)
+    return min(ways, key=lambda way: way.after)
+
+
+def _as_on_few(graph: KeyframeGraph, state: State) -> None:
+    """Poses as a few points have them, and depths by as much nearer or farther as the nearest of those; all follows."""
+    last = max(state)
+    old_end = graph.variables[last].cam_from_world
+    for k, (pose, depth) in state.items():
+        v = graph.variables[k]
+        old = v.inv_depth[:: -(-len(v.px) // len(depth))]
+        known = (old > 0) & (depth > 0)
+        times = np.where(known, depth / np.where(known, old, 1.0), 1.0)
+        graph.set_keyframe_pose(k, pose)
+        graph.set_depths(k, v.inv_depth * at_all_points(v.px, times))
+    moved = inverse(graph.variables[last].cam_from_world) @ old_end
+    graph.transform_keyframes([k for k in graph.members() if k > last], Sim3.from_rigid(moved))
 
 
 def kept_if_cheaper(
@@ -258,16 +278,20 @@ def kept_if_cheaper(
     ids: Sequence[int],
     change: Callable[[], None],
     undo: Callable[[], None] | None = None,
+    before: float | None = None,
+    steps: Sequence[tuple[float, int]] = WHOLE,
     dearer: float = 0.0,
 ) -> tuple[bool, float, float]:
     """Change the graph, and change it back unless the whole costs less around ``ids``: (kept, cost before, and after).
 
     As it is, the nearest minimum speaks for it: a solve that begins with a wide kernel may end in a worse one.
-    ``undo``: takes back what ``change`` did beside poses and depths. ``dearer``: by how much it may cost more.
+    ``undo``: takes back what ``change`` did beside poses and depths. ``before``: what it costs, if it is there already.
+    ``steps``: how it is solved after the change. ``dearer``: by how much it may cost more.
     """
-    before, state, lens = cost_around(graph, ids), state_of(graph), graph.intrinsics
+    before = cost_around(graph, ids) if before is None else before
+    state, lens = state_of(graph), graph.intrinsics
     change()
-    after = cost_around(graph, ids, WHOLE)
+    after = cost_around(graph, ids, steps)
     kept = after < before + dearer
     if not kept:
         if undo is not None:
@@ -291,8 +315,11 @@ class Scaled:
         graph.scale_keyframes(self.ids, 1 / self.times)
 
 
-def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> Scaled:
-    """Poses and depths of a passage as ``state`` has them; what follows goes with its end. What has changed scale."""
+def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State, follows: bool = True) -> Scaled:
+    """Poses and depths of a passage as ``state`` has them; what follows goes with its end, or stays where it is.
+
+    What has changed scale.
+    """
     ratio = _length_ratio(graph, ids[:3], state)
     end = ids[-1]
     old_end = Sim3.from_rigid(graph.variables[end].cam_from_world)
@@ -304,6 +331,8 @@ def replace_passage(graph: KeyframeGraph, ids: Sequence[int], state: State) -> S
         from_first[:3, 3] /= ratio
         graph.set_keyframe_pose(k, from_first @ first_pose)
         graph.set_depths(k, inv_depth * ratio)
+    if not follows:
+        return Scaled([], 1.0)
     # lengths of what follows: as its end's were, which have become ``1 / grown`` of what they were
     new_end = Sim3.from_rigid(inverse(graph.variables[end].cam_from_world))
     world_from_old = new_end @ Sim3(np.eye(3), np.zeros(3), 1 / grown) @ old_end

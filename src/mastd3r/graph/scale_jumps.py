@@ -99,7 +99,7 @@ def _rescaled(graph: KeyframeGraph, kf_id: int, ratio: float, end: int | None = 
     def undo() -> None:  # of the priors of depths, and of the frames that hang on them
         graph.transform_keyframes(after, Sim3(np.eye(3), np.zeros(3), ratio))
 
-    taken, before, now = kept_if_cheaper(graph, around, change, undo, UNTOLD)
+    taken, before, now = kept_if_cheaper(graph, around, change, undo, dearer=UNTOLD)
     frames = [graph.keyframes[k].work.index for k in (kf_id, after[-1])]
     log.info("frames %d to %d: lengths are %.2f times what they were; as before they cost %.0f -> %.0f, %s",
              *frames, ratio, before, now, "taken" if taken else "left")  # fmt: skip
