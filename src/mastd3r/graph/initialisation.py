@@ -26,6 +26,7 @@ Array = NDArray[Any]
 log = logging.getLogger(__name__)
 MIN_AGREEMENT = 0.4  # of the matches, for a start to be accepted
 LOOKED_AT = 8  # latest keyframes whose image motion must show parallax, before anything is tried
+ONE_BY_ONE = (15, 6)  # iterations of a keyframe by itself, and of all so far, where one after another is added
 FIRST_PAIRS = 2  # pairs of keyframes that a start is tried from
 SAME = 0.01  # starts whose focal lengths and costs differ by less came to the same end
 FITS_PX = 1.0  # a match further away counts as left out
@@ -213,31 +214,41 @@ def first_pairs(
 
 def attempt(graph: KeyframeGraph, pair: ReprojectionFactor) -> float | None:
     """Two views by the essential matrix, the others one by one, then all; the robust cost, None on failure."""
-    _reset(graph)
-    pose = two_view_pose(graph, pair)
-    if pose is None:
+    if not from_two_views(graph, pair):
         return None
-    pose[:3, 3] *= 0.1
-    graph.set_keyframe_pose(pair.j, pose)
-    first = [pair.i, pair.j]
-    _solve_part(graph, first, frozenset([pair.i]), 15, 2.0)
-    add_one_by_one(graph, first)
     cost = _solve_all(graph, graph.edges, 25)
     return cost if np.isfinite(cost) else None
 
 
-def add_one_by_one(graph: KeyframeGraph, first: Sequence[int]) -> None:
-    """Poses and depths of the other keyframes from those of ``first``, the nearest first; ``first[0]`` stays."""
-    done = list(first)
+def from_two_views(graph: KeyframeGraph, pair: ReprojectionFactor, iterations: tuple[int, int] = ONE_BY_ONE) -> bool:
+    """Two views by the essential matrix, the others one by one; whether the two tell of a pose."""
+    _reset(graph)
+    pose = two_view_pose(graph, pair)
+    if pose is None:
+        return False
+    pose[:3, 3] *= 0.1
+    graph.set_keyframe_pose(pair.j, pose)
+    first = [pair.i, pair.j]
+    _solve_part(graph, first, frozenset([pair.i]), 15, 2.0)
+    add_one_by_one(graph, first, iterations)
+    return True
+
+
+def add_one_by_one(graph: KeyframeGraph, first: Sequence[int], iterations: tuple[int, int] = ONE_BY_ONE) -> None:
+    """Poses and depths of the other keyframes from those of ``first``, the nearest first; ``first[0]`` stays.
+
+    ``iterations``: of each by itself, and of all that are there then.
+    """
+    done, (alone, together) = list(first), iterations
     while len(done) < len(graph.keyframes):
         k = min((k for k in graph.variables if k not in done), key=lambda k: min(abs(k - d) for d in done))
         nearest = min(done, key=lambda d: abs(k - d))
         graph.set_keyframe_pose(k, graph.variables[nearest].cam_from_world)
         _carry(graph, nearest, k)
         done.append(k)
-        _solve_part(graph, done, frozenset(done[:-1]), 15, 4.0)
+        _solve_part(graph, done, frozenset(done[:-1]), alone, 4.0)
         _carry(graph, nearest, k)
-        _solve_part(graph, done, frozenset([done[0]]), 6, 2.0)
+        _solve_part(graph, done, frozenset([done[0]]), together, 2.0)
 
 
 def _solve_all(graph: KeyframeGraph, edges: list[ReprojectionFactor], iterations: int) -> float:

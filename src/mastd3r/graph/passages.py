@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..geometry.se3 import inverse
 from ..geometry.sim3 import Sim3
 from .few_points import KERNEL_PX, State, at_all_points, chain_of_few, put_back, solved, state_of, thinned
-from .initialisation import add_one_by_one, attempt, first_pairs
+from .initialisation import add_one_by_one, first_pairs, from_two_views
 from .keyframe_graph import KeyframeGraph
 from .turning import turned
 from .windows import ALL_INTRINSICS, Window
@@ -38,13 +38,13 @@ ROUNDS = 6
 BETTER = 0.98  # of the cost, for another explanation to be taken
 SAME, EXPLANATIONS = 0.01, 2  # of the cost, by which two are told apart; of a passage, that the chain is asked about
 CHANGED = 0.02  # of the cost, from which a passage is tried again
+ONE_BY_ONE = (8, 3)  # iterations of a keyframe by itself, and of all so far: all are settled afterwards
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
 NEAR, NEAR_OF_FEW = ((KERNEL_PX, 8),), ((KERNEL_PX, 24),)  # the same of the chain, before a passage is changed
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
 WHOLE_OF_FEW = (*WHOLE[:2], (KERNEL_PX, 10))  # the same, on a few points
 SETTLED = ((1.0, 4), (KERNEL_PX, 6))  # and on all, from where a few points came to
 TOLERANCE = 1e-5  # relative, of either
-FEW = 150  # points of a keyframe of the chain
 LONG, AROUND = 256, 60  # keyframes of a chain, above which those around a passage speak for all, and so many each way
 PAIRS = (0, 2, 4)  # that a passage is begun from, of the best: the next best is often the same place again
 
@@ -175,7 +175,7 @@ def _from_turn(part: KeyframeGraph) -> bool:
 def _from_two_views(part: KeyframeGraph, nth: int) -> bool:
     """Two keyframes by their essential matrix, the others one after another; the ``nth`` best pair to begin with."""
     pairs = first_pairs(part, set(), nth + 1)
-    return nth < len(pairs) and attempt(part, pairs[nth]) is not None
+    return nth < len(pairs) and from_two_views(part, pairs[nth], ONE_BY_ONE)
 
 
 def _from_one_end(part: KeyframeGraph, end: int) -> bool:
@@ -183,7 +183,7 @@ def _from_one_end(part: KeyframeGraph, end: int) -> bool:
 
     Tracking came from one side, and from depths that nothing had confirmed yet.
     """
-    add_one_by_one(part, [sorted(part.variables)[end]])
+    add_one_by_one(part, [sorted(part.variables)[end]], ONE_BY_ONE)
     return True
 
 
@@ -241,7 +241,7 @@ def _on_few(graph: KeyframeGraph, ids: Sequence[int], explanation: State, settle
     What follows goes with the passage's end, or stays where it is, as costs less: other views may hold it there.
     """
     around, _ = _around(graph, ids)
-    ends, part = (around[0], around[-1]), chain_of_few(graph, around, FEW)
+    ends, part = (around[0], around[-1]), chain_of_few(graph, around)
     if ends not in settled.few:
         cost = solved(part, NEAR_OF_FEW, graph.held, TOLERANCE)
         settled.few[ends] = cost, state_of(part)
