@@ -299,7 +299,7 @@ def test_what_follows_stays_where_other_views_hold_it(exact_scene: Callable[...,
     right = {k: (graph.variables[k].cam_from_world.copy(), graph.variables[k].inv_depth.copy()) for k in ids}
     truth = {k: v.cam_from_world.copy() for k, v in graph.variables.items()}
     turned_away = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0]))
-    for k in ids:  # as a whole: the first of it stays where it was, the last is put elsewhere
+    for k in ids:  # as a whole, about the camera of its first: the last is elsewhere
         graph.set_keyframe_pose(k, truth[k] @ inverse(truth[ids[0]]) @ turned_away @ truth[ids[0]])
     way = passages_module._on_few(graph, ids, right, Settled())
     assert not way.follows and way.after < 0.5 * way.before

@@ -15,7 +15,7 @@ from mastd3r.geometry.sim3 import Sim3
 from mastd3r.graph import bundle_adjustment
 from mastd3r.graph.few_points import solved, thinned
 from mastd3r.graph.keyframe_graph import KeyframeGraph
-from mastd3r.graph.passages import SETTLING, cost_around
+from mastd3r.graph.passages import SETTLING, Settled, _on_few, cost_around
 from mastd3r.graph.steady_speed import SteadySpeed
 from mastd3r.graph.windows import Window, everything, in_a_row, sliding
 from mastd3r.offline.final_solve import finish_graph
@@ -135,9 +135,11 @@ def test_whole_chains_after_the_last_frame_are_solved_with_it(scene: Any, monkey
         return optimise(graph, problem, *args, **options)
 
     monkeypatch.setattr(KeyframeGraph, "optimise", seen)
+    explanation = {k: (graph.variables[k].cam_from_world, graph.variables[k].inv_depth) for k in range(4, 10)}
     for solve, steady in (
         (lambda: finish_graph(graph, Config()), {True}),
         (lambda: cost_around(graph, [4, 5]), {True}),
+        (lambda: _on_few(graph, range(4, 10), explanation, Settled()), {True}),
         (lambda: solved(thinned(graph, range(4, 10)), SETTLING[:-1]), {False}),
         (lambda: solved(thinned(graph, range(4, 10)), SETTLING[-1:]), {True}),
         (lambda: graph.solve_all(2, 1.0), {False}),

@@ -38,7 +38,7 @@ ROUNDS = 6
 BETTER = 0.98  # of the cost, for another explanation to be taken
 SAME, EXPLANATIONS = 0.01, 2  # of the cost, by which two are told apart; of a passage, that the chain is asked about
 CHANGED = 0.02  # of the cost, from which a passage is tried again
-ONE_BY_ONE = (8, 3)  # iterations of a keyframe by itself, and of all so far: all are settled afterwards
+ADDING = (8, 3)  # iterations of a keyframe by itself, and of all so far: all are settled afterwards
 SETTLING = ((4.0, 15), (1.0, 10), (KERNEL_PX, 20))  # kernel in pixels, and iterations, after a start
 NEAR, NEAR_OF_FEW = ((KERNEL_PX, 8),), ((KERNEL_PX, 24),)  # the same of the chain, before a passage is changed
 WHOLE = ((4.0, 6), (1.0, 8), (KERNEL_PX, 4))  # and after
@@ -175,7 +175,7 @@ def _from_turn(part: KeyframeGraph) -> bool:
 def _from_two_views(part: KeyframeGraph, nth: int) -> bool:
     """Two keyframes by their essential matrix, the others one after another; the ``nth`` best pair to begin with."""
     pairs = first_pairs(part, set(), nth + 1)
-    return nth < len(pairs) and from_two_views(part, pairs[nth], ONE_BY_ONE)
+    return nth < len(pairs) and from_two_views(part, pairs[nth], ADDING)
 
 
 def _from_one_end(part: KeyframeGraph, end: int) -> bool:
@@ -183,7 +183,7 @@ def _from_one_end(part: KeyframeGraph, end: int) -> bool:
 
     Tracking came from one side, and from depths that nothing had confirmed yet.
     """
-    add_one_by_one(part, [sorted(part.variables)[end]], ONE_BY_ONE)
+    add_one_by_one(part, [sorted(part.variables)[end]], ADDING)
     return True
 
 
